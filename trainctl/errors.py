@@ -1,0 +1,33 @@
+"""What can go wrong, by whose fault it is: the command line turns each into its exit code (DESIGN: 2 bad input, 3 the run failed)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+class TrainctlError(Exception):
+    """Base of all errors this package raises on purpose."""
+
+    exit_code = 3
+
+
+class InputError(TrainctlError):
+    """The user's input is wrong. Carries every mistake found, one line each: ``file: key = value: rule``."""
+
+    exit_code = 2
+
+    def __init__(self, mistakes: Sequence[str] | str) -> None:
+        self.mistakes = [mistakes] if isinstance(mistakes, str) else list(mistakes)
+        super().__init__("\n".join(self.mistakes))
+
+
+class SimulatorError(TrainctlError):
+    """SUMO stopped, or refused what it was told."""
+
+
+class CouplingError(TrainctlError):
+    """Something else than the plant moved a train: names train, edge, time and the likely cause."""
+
+
+class LawError(TrainctlError):
+    """A law or a plant gave a number that is not finite: names train and time."""

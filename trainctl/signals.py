@@ -1,0 +1,237 @@
+"""What the parts of the loop say to each other: arrays and edge lists, no behaviour of their own.
+
+Controllers, plants, observers and topology meet only here. Every array is float64, int64 or bool, C-contiguous, SI.
+
+Counts used in shapes: ``n`` trains, ``U`` units of all trains one after the other, ``L`` links, ``w`` numbers in one message.
+A train's units are the rows ``first[i]:first[i + 1]``, head first. A point train has one unit.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+#: Columns of ``own``: the state of one unit. FORCE only where the actuator has dynamics (``actuated_units``).
+POSITION, SPEED, FORCE = 0, 1, 2
+
+#: Standard gravity [m/s2].
+GRAVITY = 9.80665
+
+
+class Consists(NamedTuple):
+    """Fixed data of all trains: ``first`` has shape (n + 1,), ``davis`` (U, 3), everything else (U,).
+
+    The coupler of row ``u`` joins unit ``u`` to unit ``u + 1``; the last unit of a train has stiffness and damping 0.
+    Limits are ``inf`` where there is none.
+    """
+
+    first: Ints
+    length: Floats  # m, front of this unit to front of the next with the coupler at rest
+    mass: Floats  # kg
+    rotating: Floats  # inertia / mass, >= 1
+    davis: Floats  # c0 [N/kg], c1 [N s/(m kg)], c2 [N s2/(m2 kg)]
+    stiffness: Floats  # N/m
+    damping: Floats  # N s/m
+    traction: Floats  # N
+    traction_power: Floats  # W
+    braking: Floats  # N, positive
+    braking_power: Floats  # W
+    actuator_rate: Floats  # 1/s, r of the actuator tau' = -r tau + r demand
+
+    def train_length(self) -> Floats:
+        """Length of every train [m], shape (n,)."""
+        return np.add.reduceat(self.length, self.first[:-1])
+
+    def train_mass(self) -> Floats:
+        """Mass of every train [kg], shape (n,)."""
+        return np.add.reduceat(self.mass, self.first[:-1])
+
+
+class Links(NamedTuple):
+    """Who hears whom now: one row per directed hearing, sorted by receiver. Spacings are front to front, sender minus receiver."""
+
+    sender: Ints  # (L,)
+    receiver: Ints  # (L,)
+    first: Ints  # (n + 1,) rows first[i]:first[i + 1] are what train i hears
+    desired: Floats  # (L,) m
+    lower: Floats  # (L,) m, -inf if unbounded
+    upper: Floats  # (L,) m, inf if unbounded
+    weight: Floats  # (L,)
+    heard: Bools  # (L,) False: the last message did not arrive
+    slot: Floats  # (n,) m, wanted position relative to the reference (0 or negative); NaN where the scenario has no slots
+    order: Ints  # (n,) all trains, every train after those it hears from ahead (front to rear)
+
+
+class Bounds(NamedTuple):
+    """What each train must keep, shape (n,); infinite where unbounded."""
+
+    speed_lower: Floats  # m/s
+    speed_upper: Floats  # m/s
+    input_lower: Floats  # m/s2, applied force per mass
+    input_upper: Floats  # m/s2
+
+
+class Reference(NamedTuple):
+    """The virtual leader: piecewise polynomial position, the common form of constant, stepped, S-curve and tabulated profiles.
+
+    On ``breaks[k] <= t < breaks[k + 1]`` its position is ``sum_p position[k, p] * (t - breaks[k])**p``. The first and the
+    last piece extend beyond the ends.
+    """
+
+    breaks: Floats  # (K + 1,) s
+    position: Floats  # (K, P) m/s^p
+
+
+@njit(cache=True)
+def leader_at(reference: Reference, t: float, inside: float, out: Floats) -> None:
+    """Write position, speed, acceleration and jerk of the virtual leader at ``t`` into ``out`` (4,).
+
+    ``inside`` is any time within the piece meant: at a break the two sides differ, and an integrator's step must see one.
+    """
+    last = reference.position.shape[0] - 1
+    k = min(max(np.searchsorted(reference.breaks, inside, side="right") - 1, 0), last)
+    s = t - reference.breaks[k]
+    for d in range(4):
+        value = 0.0
+        for p in range(reference.position.shape[1] - 1, d - 1, -1):
+            factor = reference.position[k, p]
+            for q in range(d):
+                factor *= p - q
+            value = value * s + factor
+        out[d] = value
+
+
+class Trains(NamedTuple):
+    """What each train knows of itself when a sampled law is evaluated, shape (n,)."""
+
+    position: Floats  # m, front
+    speed: Floats  # m/s
+    resistance: Floats  # N/kg, running resistance and gradient at this speed and place, as the train believes them
+
+
+class Demand(NamedTuple):
+    """What a sampled law asks for, shape (n,)."""
+
+    acceleration: Floats  # m/s2, held over the control period; the input is this plus the resistance
+    saturated: Bools  # one of the law's saturations acted
+
+
+class Scene(NamedTuple):
+    """All a law needs to check its assumptions and to prepare its constants, at the start or at a change of topology."""
+
+    trains: Sequence[str]  # ids, length n
+    consists: Consists
+    own: Floats  # (U, 2) or (U, 3)
+    links: Links
+    bounds: Bounds
+    reference: Reference
+    time: float  # s
+    step: float  # s, of the simulator
+    control_period: float  # s, a multiple of step
+    lead: float  # theta: x(k+1) = x + ((1 - theta) v(k) + theta v(k+1)) T_c in the plant that carries the trains
+    sub_step: float  # s, of the integrator; equal to step for discrete plants
+
+
+class SampledLaw(Protocol):
+    """A train-level law evaluated once per control period: a module of this shape in ``trainctl.controllers``.
+
+    ``demand`` must be local: the input of a train depends on its own rows and on what the links bring it.
+    """
+
+    CLOCK: Literal["sampled"]
+    Params: Any  # frozen pydantic model: the keys of the scenario's [controller] table
+
+    def violations(self, params: Any, scene: Scene) -> list[str]:
+        """Every assumption and start condition that fails, as ``key = value: rule`` in words and numbers."""
+
+    def constants(self, params: Any, scene: Scene) -> Any:
+        """The law's constants as arrays; called again when the topology changes."""
+
+    def message(self, constants: Any, own: Trains, leader: Floats) -> Floats:
+        """What every train sends, shape (n, w), in the frame that moves with the leader, so that old data do not lag."""
+
+    def demand(self, constants: Any, own: Trains, leader: Floats, links: Links, heard: Floats) -> Demand:
+        """The law. ``heard`` (L, w) is what each link brought last; rows with ``links.heard`` False are stale."""
+
+
+class ContinuousLaw(Protocol):
+    """A unit-level law evaluated in every Runge-Kutta stage; its functions are compiled with ``numba.njit(cache=True)``.
+
+    Arrays ``own``, ``estimate``, ``correction`` and ``out`` hold the units of train ``i`` only, ``desired`` and ``heard``
+    what its links bring: locality by construction. ``constants`` is a NamedTuple of floats and arrays made by ``constants()``;
+    per-unit arrays in it are indexed from its own ``first[i]``. ``leader`` is (4,): position, speed, acceleration, jerk of the
+    reference now; ``slot`` the train's wanted position relative to it [m].
+    """
+
+    CLOCK: Literal["continuous"]
+    ORDER: Literal["parallel", "chain"]  # chain: a train's message may depend on its demand in the same instant
+    MESSAGE: int  # w
+    WATCHED: tuple[str, ...]  # names (with unit) of the constrained quantities per train that ``watch`` writes
+    Params: Any
+
+    def violations(self, params: Any, scene: Scene) -> list[str]:
+        """As in ``SampledLaw``."""
+
+    def constants(self, params: Any, scene: Scene) -> Any:
+        """The law's constants as a NamedTuple numba understands; called again when the topology changes."""
+
+    def demand(
+        self, i: int, constants: Any, leader: Floats, age: float, slot: float, own: Floats, estimate: Floats,
+        correction: Floats, desired: Floats, heard: Floats, out: Floats,
+    ) -> None:  # fmt: skip
+        """Write the demanded force of each unit [N] into ``out``. ``desired`` (k,) and ``heard`` (k, w) are the rows of the k
+        links train ``i`` hears on; ``age`` [s] is how old ``heard`` is (0 in the exact mode)."""
+
+    def message(
+        self, i: int, constants: Any, leader: Floats, slot: float, own: Floats, estimate: Floats, estimate_rate: Floats, out: Floats
+    ) -> None:
+        """Write what train ``i`` sends into ``out`` (w,)."""
+
+    def watch(self, i: int, constants: Any, leader: Floats, first: Ints, own: Floats, links: Links, out: Floats) -> None:
+        """Write the constrained quantities of train ``i`` into ``out``; here ``own`` is that of all trains (this is a monitor)."""
+
+
+class Observer(Protocol):
+    """Estimates per unit, integrated with plant and law; compiled like a continuous law.
+
+    ``WIDTH`` columns of ``estimate`` and ``CORRECTIONS`` columns of ``correction`` per unit; none if there is no observer.
+    """
+
+    WIDTH: int
+    CORRECTIONS: int
+
+    def correction(self, i: int, constants: Any, own: Floats, estimate: Floats, out: Floats) -> None: ...
+
+    def rate(
+        self, i: int, constants: Any, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats
+    ) -> None: ...
+
+
+class Plant(Protocol):
+    """Motion of the units of train ``i``; compiled like a continuous law. ``own`` has ``STATES`` columns."""
+
+    STATES: int
+
+    def limit(self, i: int, constants: Any, own: Floats, applied: Floats) -> bool:
+        """Clip ``applied`` [N] to what the units can do, in place; True if a limit acted."""
+
+    def rate(
+        self, i: int, constants: Any, t: float, inside: float, own: Floats, applied: Floats, out: Floats, power: Floats
+    ) -> None:
+        """Write d(own)/dt into ``out`` and the train's powers [W] into ``power`` (6,): see ``POWERS``. ``inside`` is a time
+        within the piece meant where something jumps at ``t``."""
+
+
+#: What ``Plant.rate`` writes into ``power``; each is the rate of an energy [W]. Kinetic plus coupler energy changes by
+#: traction - braking - resistance - damping - gradient + disturbance.
+POWERS = ("traction", "braking", "resistance", "damping", "gradient", "disturbance")
