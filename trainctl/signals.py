@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,6 +27,12 @@ POSITION, SPEED, FORCE = 0, 1, 2
 
 #: Standard gravity [m/s2].
 GRAVITY = 9.80665
+
+
+class Table(BaseModel):
+    """One table of a scenario: frozen, unknown keys refused, no infinities or NaN, no silent conversion of text to numbers."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
 
 class Consists(NamedTuple):
