@@ -1,0 +1,299 @@
+"""Streaming writer of a run folder: column arrays in, Parquet files of fixed-size row groups out, bounded memory.
+
+In short::
+
+    info = about_run(scenario_text, seed, sys.argv)
+    partial = claim(out)                                     # DIR.partial, or InputError
+    write_info(partial, info)
+    with Recorder(partial, standard_tables(trains, tracks, edges)) as recorder:
+        recorder.write("trains", time_s=t, train=codes, position_m=x, ...)   # every step
+        recorder.event(t, "topology", links=[[1, 3], [3, 4]])
+    write_info(partial, {**info, "status": "complete", "steps": n, "wall_time_s": w})
+    finish(out)                                              # DIR.partial -> DIR
+
+Until ``close`` the rows lie in closed segments (``segments/trains-00000.parquet``), because a Parquet file that was not closed
+cannot be read: a killed run keeps all but its last segment. The final files do not depend on where the segments were cut.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Literal, Self
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import ArrayLike, NDArray
+
+from trainctl.record.folder import SCHEMA_VERSION, plain, remove
+from trainctl.signals import POWERS
+
+#: A column: a number, or one of a fixed list of names (written as integer codes into that list; -1 is "none").
+Column = Literal["float", "int", "bool"] | Sequence[str]
+Columns = Mapping[str, Column]
+
+GROUP_ROWS = 65_536
+SEGMENT_GROUPS = 16
+
+#: Optional columns of trains.parquet: energies [J] since the train's last row, one per entry of ``signals.POWERS``.
+ENERGIES = tuple(f"{power}_j" for power in POWERS)
+#: Optional columns of units.parquet, for the laws and plants that know them.
+UNIT_EXTRAS = (
+    "law_input", "fault_mps3", "fault_estimate_mps3", "acceleration_mps2", "acceleration_estimate_mps2",
+)  # fmt: skip
+
+_DTYPES = {"float": np.float64, "int": np.int32, "bool": np.bool_}
+
+
+def standard_tables(
+    trains: Sequence[str],
+    tracks: Sequence[str],
+    edges: Sequence[str],
+    *,
+    units: bool = True,
+    watched: Sequence[str] = (),
+    train_extras: Sequence[str] = (),
+    unit_extras: Sequence[str] = (),
+) -> dict[str, Columns]:
+    """The tables of a run folder: trains, links and, if wanted, units.
+
+    Parameters
+    ----------
+    trains, tracks, edges : sequence of str
+        The names that the codes in ``train`` (``sender``, ``receiver``), ``track`` and ``edge`` stand for.
+    units : bool
+        Whether there is a units table.
+    watched : sequence of str
+        The law's ``WATCHED``: each gives two columns of trains, ``<watched>_min`` and ``<watched>_max``.
+    train_extras, unit_extras : sequence of str
+        Further columns of numbers: ``ENERGIES``, disturbances; any of ``UNIT_EXTRAS``.
+    """
+    floats = dict.fromkeys
+    tables: dict[str, Columns] = {
+        "trains": {
+            "time_s": "float", "train": trains, "track": tracks, "edge": edges,
+            **floats(("position_m", "speed_mps", "input_mps2", "spacing_m", "gap_m"), "float"), "saturated": "bool",
+            **floats((f"{name}_{end}" for name in watched for end in ("min", "max")), "float"),
+            **floats(train_extras, "float"),
+        },
+        "links": {
+            "time_s": "float", "sender": trains, "receiver": trains,
+            **floats(("spacing_m", "desired_m", "lower_m", "upper_m"), "float"), "heard": "bool",
+        },
+    }  # fmt: skip
+    if units:
+        numbers = ("position_m", "speed_mps", "force_n", "coupler_m", "coupler_force_n")
+        extremes = ("coupler_min_m", "coupler_max_m", "force_min_n", "force_max_n")
+        tables["units"] = {
+            "time_s": "float", "train": trains, "unit": "int", **floats((*numbers, *extremes, *unit_extras), "float"),
+        }  # fmt: skip
+    return tables
+
+
+class Recorder:
+    """Writes the tables and the events of one run into a folder.
+
+    Parameters
+    ----------
+    folder : Path
+        An existing directory (``DIR.partial``).
+    tables : mapping
+        Columns of each table, see ``standard_tables``.
+    metadata : mapping, optional
+        Text that goes into every Parquet footer beside ``schema_version``. No clocks: the files must not differ between
+        two runs of the same scenario.
+    resume : mapping, optional
+        What ``cut`` returned: everything recorded later is dropped and the recording goes on from there.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        tables: Mapping[str, Columns],
+        metadata: Mapping[str, str] | None = None,
+        *,
+        resume: Mapping[str, Any] | None = None,
+        group_rows: int = GROUP_ROWS,
+        segment_groups: int = SEGMENT_GROUPS,
+    ) -> None:
+        self.folder = folder
+        self._segments = folder / "segments"
+        self._segments.mkdir(exist_ok=True)
+        kept = dict(resume["segments"]) if resume else {}
+        self._tables = {
+            name: _Segments(self._segments, name, columns, dict(metadata or {}), group_rows, segment_groups, kept.get(name, 0))
+            for name, columns in tables.items()
+        }
+        self._events: IO[bytes] = open(folder / "events.jsonl", "r+b" if resume else "wb")  # noqa: SIM115  closed by close()
+        if resume:
+            self._events.truncate(resume["events_bytes"])
+            self._events.seek(0, os.SEEK_END)
+
+    def write(self, table: str, **values: ArrayLike) -> None:
+        """Append rows: one array per column, all of one length; a scalar stands for all rows. Names come as integer codes."""
+        self._tables[table].append(values)
+
+    def event(self, time_s: float, kind: str, **fields: Any) -> None:
+        """Append a line to events.jsonl, at once."""
+        line = json.dumps(plain({"time_s": time_s, "kind": kind, **fields}), separators=(",", ":"))
+        self._events.write(line.encode() + b"\n")
+        self._events.flush()
+
+    def cut(self) -> dict[str, Any]:
+        """Close the segments, so that all rows until now survive a kill. Returns what ``resume`` needs (plain JSON)."""
+        for table in self._tables.values():
+            table.cut()
+        self._events.flush()
+        os.fsync(self._events.fileno())
+        return {"segments": {name: t.count for name, t in self._tables.items()}, "events_bytes": self._events.tell()}
+
+    def close(self) -> None:
+        """Write ``<table>.parquet`` from the segments and remove them. If the disk is full the segments stay readable."""
+        if self._events.closed:
+            return
+        self._events.close()
+        for table in self._tables.values():
+            table.cut()
+        for name, table in self._tables.items():
+            table.join(self.folder / f"{name}.parquet")
+        remove(self._segments)
+
+    def __enter__(self) -> Self:
+        """Itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Close, whatever happened; a disk full while closing does not hide an earlier error."""
+        try:
+            self.close()
+        except OSError:
+            if error is None:
+                raise
+
+
+class _Segments:
+    """One table as a row of closed files ``<name>-<number>.parquet``; the one being written ends in ``.open``."""
+
+    def __init__(
+        self, folder: Path, name: str, columns: Columns, metadata: dict[str, str], group_rows: int, segment_groups: int, kept: int
+    ) -> None:
+        self.folder, self.name, self.columns, self.count = folder, name, columns, kept
+        self.metadata = {"table": name, **metadata}
+        self.group_rows, self.segment_rows = group_rows, group_rows * segment_groups
+        self.stream: _Stream | None = None
+        for path in folder.glob(f"{name}-*"):
+            if path.suffix == ".open" or int(path.stem.rpartition("-")[2]) >= kept:
+                path.unlink()
+
+    def path(self, number: int) -> Path:
+        return self.folder / f"{self.name}-{number:05d}.parquet"
+
+    def append(self, values: Mapping[str, ArrayLike]) -> None:
+        if self.stream is None:
+            self.stream = _Stream(self.path(self.count).with_suffix(".open"), self.columns, self.metadata, self.group_rows)
+        self.stream.append(values)
+        if self.stream.rows >= self.segment_rows:
+            self.cut()
+
+    def cut(self) -> None:
+        if self.stream is None:
+            return
+        stream, self.stream = self.stream, None
+        stream.close()
+        os.replace(stream.path, self.path(self.count))
+        self.count += 1
+
+    def join(self, target: Path) -> None:
+        """One file of full row groups out of all segments, the same bytes wherever they were cut."""
+        if self.count == 1:  # its groups are full already
+            os.replace(self.path(0), target)
+            return
+        stream = _Stream(target.with_suffix(".open"), self.columns, self.metadata, self.group_rows)
+        try:
+            for number in range(self.count):
+                with pq.ParquetFile(self.path(number)) as file:
+                    for group in range(file.num_row_groups):
+                        stream.append(self.values(file.read_row_group(group)))
+            stream.close()
+        except OSError:
+            remove(stream.path)
+            raise
+        os.replace(stream.path, target)
+
+    def values(self, table: pa.Table) -> dict[str, NDArray[Any]]:
+        """Back from Arrow to what ``append`` takes."""
+        out: dict[str, NDArray[Any]] = {}
+        for name, column in self.columns.items():
+            array = table[name].combine_chunks()
+            if not isinstance(column, str):
+                place = {text: code for code, text in enumerate(column)}
+                codes = np.array([place[text] for text in array.dictionary.to_pylist()] + [-1], dtype=np.int32)
+                array = codes[array.indices.fill_null(-1).to_numpy(zero_copy_only=False)]
+            out[name] = array if isinstance(array, np.ndarray) else array.to_numpy(zero_copy_only=False)
+        return out
+
+
+class _Stream:
+    """One Parquet file of row groups of ``group_rows`` rows, the last one shorter."""
+
+    def __init__(self, path: Path, columns: Columns, metadata: Mapping[str, str], group_rows: int) -> None:
+        self.path, self.columns, self.group_rows = path, columns, group_rows
+        self.rows = self.filled = 0
+        self.buffers = {
+            name: np.empty(group_rows, dtype=_DTYPES[column] if isinstance(column, str) else np.int32)
+            for name, column in columns.items()
+        }
+        self.names = {name: pa.array(column, pa.string()) for name, column in columns.items() if not isinstance(column, str)}
+        self.schema = pa.schema(
+            [(name, pa.dictionary(pa.int32(), pa.string()) if name in self.names else pa.from_numpy_dtype(buffer.dtype))
+             for name, buffer in self.buffers.items()],
+            metadata={"schema_version": str(SCHEMA_VERSION), **metadata},
+        )  # fmt: skip
+        floats = [name for name, column in columns.items() if column == "float"]
+        self.writer = pq.ParquetWriter(
+            path,
+            self.schema,
+            compression="zstd",
+            use_dictionary=[name for name in columns if name not in floats],
+            column_encoding=dict.fromkeys(floats, "BYTE_STREAM_SPLIT"),
+        )
+
+    def append(self, values: Mapping[str, ArrayLike]) -> None:
+        if values.keys() != self.columns.keys():
+            raise ValueError(f"{self.path.name}: columns {sorted(values.keys() ^ self.columns.keys())} missing or unknown")
+        arrays = {name: np.asarray(value) for name, value in values.items()}
+        lengths = {len(array) for array in arrays.values() if array.ndim}
+        if len(lengths) > 1:
+            raise ValueError(f"{self.path.name}: columns of different lengths {sorted(lengths)}")
+        count, done = lengths.pop() if lengths else 1, 0
+        while done < count:
+            fits = min(count - done, self.group_rows - self.filled)
+            for name, array in arrays.items():
+                self.buffers[name][self.filled : self.filled + fits] = array[done : done + fits] if array.ndim else array
+            self.filled, done = self.filled + fits, done + fits
+            if self.filled == self.group_rows:
+                self.flush()
+        self.rows += count
+
+    def flush(self) -> None:
+        """Write what is buffered as one row group."""
+        if self.filled:
+            table = pa.Table.from_arrays(list(self.arrays()), schema=self.schema)
+            self.writer.write_table(table, row_group_size=self.group_rows)
+        self.filled = 0
+
+    def arrays(self) -> Iterable[pa.Array]:
+        for name, buffer in self.buffers.items():
+            part = buffer[: self.filled]
+            if name in self.names:
+                yield pa.DictionaryArray.from_arrays(pa.array(part, mask=part < 0), self.names[name])
+            else:
+                yield pa.array(part)
+
+    def close(self) -> None:
+        self.flush()
+        self.writer.close()
