@@ -1,0 +1,353 @@
+"""Fully distributed control of constrained discrete-time trains [1]_: spacing, speed and input bounds kept at every step.
+
+Each train hears only its neighbours. It predicts where it will be one period ahead, moves towards the mean of its links'
+errors, and clips that move s to half of the room its links leave, to the room of its speed and to that of its input. The law is
+a deadbeat speed command, ``v_i(k+1) = v_r + s_i / T``.
+
+Symbols
+-------
+========================  ==================================================================================================
+i, j, N_i                 a train, one of its neighbours, all of them (``Links`` rows received by i)
+x, v                      front position [m], speed [m/s]
+x_r, v_r                  position [m] and speed [m/s] of the virtual leader
+T                         control period [s]
+theta                     lead of the plant: ``x(k+1) = x + ((1 - theta) v(k) + theta v(k+1)) T``; 0 in the paper
+z                         ``x + (1 - theta) v T - x_r`` [m], what a train sends; ``z_ji = z_j - z_i``
+d, gamma, Gamma           desired spacing, its lower and upper bound [m], here of ``z_ji``: x_j - x_i
+rho, Rho, mu, Mu          lower and upper bounds of speed [m/s] and input [m/s2]
+f, F                      least and greatest running resistance on [rho, Rho] [m/s2]
+alpha, beta, eta          how far back the links, the speed and the input let a train move in the moving frame [m], eq. (10)
+Alpha, Beta, Eta          how far forward
+G, s                      wanted and admitted move [m], eqs. (10), (12)
+========================  ==================================================================================================
+
+Departures from [1]_, each shown in ``tests/paper/test_fully_distributed.py``
+-------------------------------------------------------------------------------
+* The paper says that relative positions suffice. ``ybar_ij(k+1)`` needs the neighbours' speeds too; a train therefore sends
+  ``z``. With theta = 0 this is the paper's prediction ``x + v T``; for other plants the same proof holds for ``z``.
+* The start condition (13) bounds ``x_ij(1)`` only. ``x_ij(0)`` is checked as well.
+* Existence of d_i needs the desired spacings to sum to zero around *every* cycle; on triangles alone is not enough.
+* (10) prints two lower ``beta_i``: the second is the upper one.
+* ``join = "ratchet"``: a link that violates (13) works with ``min(gamma, z_ji)`` and ``max(Gamma, z_ji)``, so that s = 0 stays
+  admissible. The printed law (``"strict"``) then meets delta > Delta and breaks links that were sound.
+* ``eta = "own_speed"``: the input room at the train's own speed instead of the worst one in the band.
+* A train that misses any message of the period keeps the reference speed, s = 0. Leaving the neighbour out is not safe.
+
+References
+----------
+.. [1] Zhang, Chen, Fang, "Cooperative Control of Constrained Discrete-Time Multi-Train Systems: A Fully Distributed Approach".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from trainctl.signals import POSITION, SPEED, Bools, Consists, Demand, Floats, Links, Reference, Scene, Table, Trains, leader_at
+
+CLOCK: Literal["sampled"] = "sampled"
+
+#: A start on a bound is inside; sums of positions are good to about 1e-9.
+ROUNDING = 1e-6
+
+
+class Params(Table):
+    """Keys of ``[controller]`` with ``law = "fully_distributed"``. All bounds and distances are those of trains and links."""
+
+    eta: Literal["printed", "own_speed"] = Field(
+        default="printed", description="input room [m]: at the worst speed of the band (eq. 10) or at the train's own"
+    )
+    join: Literal["ratchet", "strict"] = Field(
+        default="ratchet", description="links outside eq. (13): widen their bounds to what is, or use them as printed"
+    )
+
+
+class Constants(NamedTuple):
+    """The law's constants; arrays have shape (n,), ``davis`` (n, 3)."""
+
+    period: float  # T [s]
+    theta: float
+    rho: Floats
+    Rho: Floats
+    mu: Floats
+    Mu: Floats
+    f: Floats
+    F: Floats
+    davis: Floats
+    held: bool  # the acceleration is held while the resistance changes
+    own_speed: bool
+    ratchet: bool
+
+
+def constants(params: Params, scene: Scene) -> Constants:
+    """Constants of the law; see ``SampledLaw``."""
+    davis = _train_davis(scene.consists)
+    f, F = _resistance_range(davis, scene.bounds.speed_lower, scene.bounds.speed_upper)
+    return Constants(
+        period=scene.control_period, theta=scene.lead,
+        rho=scene.bounds.speed_lower, Rho=scene.bounds.speed_upper,
+        mu=scene.bounds.input_lower, Mu=scene.bounds.input_upper,
+        f=f, F=F, davis=davis,
+        held=scene.control_period > scene.sub_step * 1.5,
+        own_speed=params.eta == "own_speed", ratchet=params.join == "ratchet",
+    )  # fmt: skip
+
+
+def message(constants: Constants, own: Trains, leader: Floats) -> Floats:
+    """Send where the train will be one period ahead, relative to the virtual leader now: ``z``, shape (n, 1) [m].
+
+    In the moving frame a message that comes late is off by what its sender has moved against the formation, not by v_r T.
+    """
+    z = own.position + (1.0 - constants.theta) * own.speed * constants.period - leader[POSITION]
+    return np.expand_dims(z, 1)
+
+
+def demand(constants: Constants, own: Trains, leader: Floats, links: Links, heard: Floats) -> Demand:
+    """Acceleration ubar_i of every train: eqs. (10), (11).
+
+    Parameters
+    ----------
+    constants : Constants
+        From ``constants()``.
+    own : Trains
+        What each train knows of itself.
+    leader : ndarray, shape (4,)
+        Position [m], speed [m/s], ... of the virtual leader.
+    links : Links
+        Who hears whom, desired spacings and their bounds [m].
+    heard : ndarray, shape (L, 1)
+        The neighbours' ``z`` [m]. Rows not heard may hold anything.
+
+    Returns
+    -------
+    Demand
+        Acceleration [m/s2], and whether a saturation acted.
+
+    Notes
+    -----
+    Departs from [1]_ as the module says. delta > Delta does occur by rounding when a train sits on a bound.
+    """
+    T, v, v_r = constants.period, own.speed, leader[SPEED]
+    z = message(constants, own, leader)[:, 0]
+    z_ji = np.where(links.heard, heard[:, 0] - z[links.receiver], links.desired)
+    gamma, Gamma = links.lower, links.upper
+    if constants.ratchet:
+        gamma, Gamma = np.minimum(gamma, z_ji), np.maximum(Gamma, z_ji)
+
+    neighbours = np.diff(links.first)
+    some = neighbours > 0  # reduceat mistakes an empty range for one element
+    begin = links.first[:-1][some]
+    alpha, Alpha = np.full_like(z, -np.inf), np.full_like(z, np.inf)
+    G, hold = np.zeros_like(z), np.zeros(len(z), dtype=bool)
+    alpha[some] = np.maximum.reduceat((z_ji - Gamma) / 2, begin)
+    Alpha[some] = np.minimum.reduceat((z_ji - gamma) / 2, begin)
+    G[some] = np.add.reduceat(z_ji - links.desired, begin) / (2 * neighbours[some])
+    hold[some] = np.logical_or.reduceat(~links.heard, begin)
+
+    beta, Beta = (constants.rho - v_r) * T, (constants.Rho - v_r) * T
+    eta, Eta = _input_room(constants, own, v_r)
+    delta = np.maximum(alpha, np.maximum(beta, eta))
+    Delta = np.minimum(Alpha, np.minimum(Beta, Eta))
+    sat = np.where(G >= Delta, Delta, np.maximum(G, delta))
+    s = np.where(hold, 0.0, sat)
+    return Demand(acceleration=(v_r + s / T - v) / T, saturated=(s != G) & ~hold)
+
+
+def _input_room(constants: Constants, own: Trains, v_r: float) -> tuple[Floats, Floats]:
+    """Eta of (10), both sides [m]."""
+    c, T = constants, constants.period
+    if not c.own_speed:
+        return c.Rho * T + (c.mu - c.f) * T**2 - v_r * T, c.rho * T + (c.Mu - c.F) * T**2 - v_r * T
+    least = greatest = own.resistance
+    if c.held:  # the input is acceleration plus resistance, and the latter changes while the former is held
+        now = _resistance(own.speed, c.davis)
+        least, greatest = own.resistance + (c.f - now), own.resistance + (c.F - now)
+    vbar = own.speed - v_r
+    return vbar * T + (c.mu - least) * T**2, vbar * T + (c.Mu - greatest) * T**2
+
+
+def _resistance(v: Floats, davis: Floats) -> Floats:
+    return davis[:, 0] + davis[:, 1] * v + davis[:, 2] * v**2
+
+
+def _train_davis(consists: Consists) -> Floats:
+    """Davis coefficients per train, (n, 3): the mean of its units weighted by mass."""
+    weighted = np.add.reduceat(consists.mass[:, None] * consists.davis, consists.first[:-1])
+    return np.asarray(weighted / consists.train_mass()[:, None])
+
+
+def _resistance_range(davis: Floats, rho: Floats, Rho: Floats) -> tuple[Floats, Floats]:
+    """Least and greatest resistance on [rho, Rho], (n,) each: at an end or at the parabola's vertex."""
+    bent = davis[:, 2] != 0.0
+    vertex = np.where(bent, -davis[:, 1] / (2 * np.where(bent, davis[:, 2], 1.0)), rho)
+    at = np.array([_resistance(v, davis) for v in (rho, Rho, np.clip(vertex, rho, Rho))])
+    return at.min(axis=0), at.max(axis=0)
+
+
+# What must hold before the law may be used
+
+
+def violations(params: Params, scene: Scene) -> list[str]:
+    """Assumptions 2.2 to 2.4, the start condition (13), ``x_ij(0)`` and ``v_i(0)``: all that fails, in words and numbers.
+
+    Connectedness (Assumption 2.1) is the topology's to report: a train without links follows the reference speed. With
+    ``join = "ratchet"`` links outside their bounds are a mistake at time 0 only; later they are joins, which the ratchet admits.
+    """
+    found = [*_speed_violations(scene), *_link_violations(scene)]
+    if params.join == "strict" or scene.time <= 0.0:
+        found += _start_violations(scene)
+    return found
+
+
+def _per_train(scene: Scene, bad: Bools, texts: list[str]) -> Iterator[str]:
+    """One line for all trains if they all fail alike, else one line per train."""
+    if len(texts) > 1 and bad.all() and len(set(texts)) == 1:
+        yield f"bounds.{texts[0]}"
+        return
+    for i in np.flatnonzero(bad).tolist():
+        yield f"train[{scene.trains[i]}].{texts[i]}"
+
+
+def _speed_violations(scene: Scene) -> Iterator[str]:
+    """v_i(0) in its band, Assumptions 2.3 and 2.4."""
+    rho, Rho, mu, Mu = scene.bounds
+    T, n = scene.control_period, len(scene.trains)
+    finite = True
+    for key, value in (("speed_lower_mps", rho), ("speed_upper_mps", Rho)):
+        unbounded = ~np.isfinite(value)
+        finite &= not unbounded.any()
+        yield from _per_train(scene, unbounded, [f"{key} = {u:g}: this law needs a finite bound (Assumption 2.3)" for u in value])
+    if not finite:
+        return
+
+    v = scene.own[scene.consists.first[:-1], SPEED]
+    for i in np.flatnonzero(v < rho - ROUNDING).tolist():
+        yield f"train[{scene.trains[i]}].speed_mps = {v[i]:.10g}: below speed_lower_mps = {rho[i]:.10g}"
+    for i in np.flatnonzero(v > Rho + ROUNDING).tolist():
+        yield f"train[{scene.trains[i]}].speed_mps = {v[i]:.10g}: above speed_upper_mps = {Rho[i]:.10g}"
+
+    slow, fast = _speed_range(scene.reference, scene.time)
+    low = [f"speed_lower_mps = {u:.10g}: must be below the reference speed {slow:.10g} m/s (Assumption 2.3)" for u in rho]
+    high = [f"speed_upper_mps = {u:.10g}: must be above the reference speed {fast:.10g} m/s (Assumption 2.3)" for u in Rho]
+    yield from _per_train(scene, rho >= slow, low)
+    yield from _per_train(scene, Rho <= fast, high)
+
+    f, F = _resistance_range(_train_davis(scene.consists), rho, Rho)
+    brakes, pulls = mu < f, F < Mu
+    low = [f"input_lower_mps2 = {mu[i]:.10g}: must be below the least running resistance {f[i]:.6g} m/s2 between "
+           f"{rho[i]:.10g} and {Rho[i]:.10g} m/s (Assumption 2.4)" for i in range(n)]  # fmt: skip
+    high = [f"input_upper_mps2 = {Mu[i]:.10g}: must be above the greatest running resistance {F[i]:.6g} m/s2 between "
+            f"{rho[i]:.10g} and {Rho[i]:.10g} m/s (Assumption 2.4)" for i in range(n)]  # fmt: skip
+    yield from _per_train(scene, ~brakes, low)
+    yield from _per_train(scene, ~pulls, high)
+
+    down, up = f - (Rho - slow) / T, F + (fast - rho) / T
+    cure = ""
+    if brakes.all() and pulls.all():
+        period = max(np.max((Rho - slow) / (f - mu)), np.max((fast - rho) / (Mu - F)))
+        cure = f", or run.control_period_s above {period:.6g}"
+    low = [f"input_lower_mps2 = {mu[i]:.10g}: must be below {down[i]:.6g} to brake from {Rho[i]:.10g} to {slow:.10g} m/s within "
+           f"one control period of {T:.10g} s{cure} (Assumption 2.4)" for i in range(n)]  # fmt: skip
+    high = [f"input_upper_mps2 = {Mu[i]:.10g}: must be above {up[i]:.6g} to accelerate from {rho[i]:.10g} to {fast:.10g} m/s within "
+            f"one control period of {T:.10g} s{cure} (Assumption 2.4)" for i in range(n)]  # fmt: skip
+    yield from _per_train(scene, brakes & (mu >= down), low)
+    yield from _per_train(scene, pulls & (Mu <= up), high)
+
+
+def _speed_range(reference: Reference, time: float) -> tuple[float, float]:
+    """Least and greatest speed of the virtual leader from ``time`` on, looked up at both ends of its pieces [m/s]."""
+    out, speeds = np.empty(4), []
+    leader_at(reference, time, time, out)
+    speeds.append(out[SPEED])
+    for start, end in zip(reference.breaks[:-1], reference.breaks[1:], strict=True):
+        for t in (start, end):
+            if np.isfinite(t) and t > time:
+                leader_at(reference, t, start, out)
+                speeds.append(out[SPEED])
+    return float(min(speeds)), float(max(speeds))
+
+
+def _pairs(scene: Scene) -> list[int]:
+    """One row per pair of trains, that with the train ahead as sender where both are there."""
+    links, seen = scene.links, dict[tuple[int, int], int]()
+    for row, (j, i) in enumerate(zip(links.sender.tolist(), links.receiver.tolist(), strict=True)):
+        other = seen.get((min(i, j), max(i, j)))
+        if other is None or links.desired[row] > links.desired[other]:
+            seen[min(i, j), max(i, j)] = row
+    return list(seen.values())
+
+
+def _name(scene: Scene, row: int) -> str:
+    links = scene.links
+    return f"link[{scene.trains[links.sender[row]]},{scene.trains[links.receiver[row]]}]"
+
+
+def _link_violations(scene: Scene) -> Iterator[str]:
+    """Assumption 2.2, and trains that have a length."""
+    links = scene.links
+    rows = {(j, i): row for row, (j, i) in enumerate(zip(links.sender.tolist(), links.receiver.tolist(), strict=True))}
+    length = scene.consists.train_length()
+    for row in _pairs(scene):
+        j, i = int(links.sender[row]), int(links.receiver[row])
+        name, d, lower, upper = _name(scene, row), links.desired[row], links.lower[row], links.upper[row]
+        back = rows.get((i, j))
+        if back is None:
+            yield f"{name}: train {scene.trains[j]} must hear train {scene.trains[i]} too, this law needs links both ways"
+        elif not np.allclose((d, lower, upper), (-links.desired[back], -links.upper[back], -links.lower[back]), 0.0, ROUNDING):
+            yield f"{name}: desired_m, lower_m and upper_m must be the same both ways with the sign changed (Assumption 2.2)"
+        if links.weight[row] != 1.0:
+            yield f"{name}.weight = {links.weight[row]:.10g}: this law has no weights, only 1"
+        if not lower < d:
+            yield f"{name}.lower_m = {lower:.10g}: must be below desired_m = {d:.10g} (Assumption 2.2)"
+        if not d < upper:
+            yield f"{name}.upper_m = {upper:.10g}: must be above desired_m = {d:.10g} (Assumption 2.2)"
+        if 0.0 < d and lower < length[j]:
+            yield f"{name}.lower_m = {lower:.10g}: spacing is front to front, and train {scene.trains[j]} is {length[j]:.10g} m"
+    yield from _cycle_violations(scene)
+
+
+def _cycle_violations(scene: Scene) -> Iterator[str]:
+    """Assumption 2.2 on every cycle: a spanning forest gives the offsets, each link outside it closes one cycle."""
+    links, n = scene.links, len(scene.trains)
+    offset, parent, depth = np.full(n, np.nan), np.full(n, -1), np.zeros(n, dtype=int)
+    for root in range(n):
+        if not np.isnan(offset[root]):
+            continue
+        offset[root], queue = 0.0, [root]
+        for i in queue:  # breadth first, so the cycles named are short
+            for row in range(links.first[i], links.first[i + 1]):
+                j = links.sender[row]
+                if np.isnan(offset[j]):
+                    offset[j], parent[j], depth[j] = offset[i] + links.desired[row], i, depth[i] + 1
+                    queue.append(int(j))
+    for row in _pairs(scene):
+        j, i = int(links.sender[row]), int(links.receiver[row])
+        around = links.desired[row] - (offset[j] - offset[i])
+        if abs(around) > ROUNDING:
+            ahead, behind = [j], [i]
+            while ahead[-1] != behind[-1]:
+                side = ahead if depth[ahead[-1]] >= depth[behind[-1]] else behind
+                side.append(int(parent[side[-1]]))
+            cycle = "-".join(scene.trains[k] for k in [i, *ahead, *behind[-2::-1]])
+            yield (
+                f"{_name(scene, row)}.desired_m = {links.desired[row]:.10g}: desired distances around the cycle {cycle} sum to "
+                f"{around:.10g} m, must be 0 (Assumption 2.2)"
+            )
+
+
+def _start_violations(scene: Scene) -> Iterator[str]:
+    """x_ij(0), and (13) for this plant: both within [gamma, Gamma]."""
+    own = scene.own[scene.consists.first[:-1]]
+    x = own[:, POSITION]
+    z = x + (1.0 - scene.lead) * own[:, SPEED] * scene.control_period
+    links = scene.links
+    for row in _pairs(scene):
+        j, i = links.sender[row], links.receiver[row]
+        for spacing, when in ((x[j] - x[i], "at the start"), (z[j] - z[i], "one period ahead, eq. (13),")):
+            if spacing < links.lower[row] - ROUNDING:
+                yield f"{_name(scene, row)}.lower_m = {links.lower[row]:.10g}: spacing {when} is {spacing:.10g} m, too small"
+            if spacing > links.upper[row] + ROUNDING:
+                yield f"{_name(scene, row)}.upper_m = {links.upper[row]:.10g}: spacing {when} is {spacing:.10g} m, too large"

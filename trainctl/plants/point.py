@@ -1,0 +1,178 @@
+"""Trains as points: the exact discrete maps of fully_distributed, eq. (1), and robust_constrained, eqs. (1) and (4).
+
+Explicit Euler, as printed: the position moves with the *old* speed. Disturbances and clamps are those of robust_constrained;
+without them both maps are the same one.
+
+Symbols: R running resistance, a demanded acceleration, u input, w1, w2, w3 disturbances, S_U and S_V clamps to the sets of
+admissible inputs and speeds, T step.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import Field, ValidationInfo, field_validator
+
+from trainctl.signals import POSITION, SPEED, Bools, Consists, Floats, Table
+
+
+class Params(Table):
+    """Keys of ``[plant]`` with ``kind = "point"``: clamps that are part of the plant. None by default."""
+
+    input_lower_mps2: float | None = Field(
+        default=None, description="least applied input, end of U [m/s2]; robust_constrained eq. (4)"
+    )
+    input_upper_mps2: float | None = Field(
+        default=None, description="greatest applied input, end of U [m/s2]; robust_constrained eq. (4)"
+    )
+    speed_lower_mps: float | None = Field(default=None, description="least speed, end of V [m/s]; robust_constrained eq. (4)")
+    speed_upper_mps: float | None = Field(default=None, description="greatest speed, end of V [m/s]; robust_constrained eq. (4)")
+
+    @field_validator("input_upper_mps2", "speed_upper_mps")
+    @classmethod
+    def _above_lower(cls, upper: float | None, info: ValidationInfo) -> float | None:
+        key = str(info.field_name).replace("upper", "lower")
+        lower = info.data.get(key)
+        if upper is not None and lower is not None and upper <= lower:
+            raise ValueError(f"must be above {key} = {lower:g}")
+        return upper
+
+
+class Constants(NamedTuple):
+    """Data of all trains, ``davis`` (n, 3), everything else (n,)."""
+
+    davis: Floats  # c0 [N/kg], c1 [N s/(m kg)], c2 [N s2/(m2 kg)] as the trains believe them
+    resistance_factor: Floats  # true / believed resistance
+    input_lower: Floats  # m/s2, -inf if there is no clamp
+    input_upper: Floats  # m/s2
+    speed_lower: Floats  # m/s
+    speed_upper: Floats  # m/s
+
+
+class Kick(NamedTuple):
+    """Disturbances of one step, shape (n,)."""
+
+    position: Floats  # w1 [m]
+    speed: Floats  # w2 [m/s]
+    input: Floats  # w3 [m/s2]
+
+    @classmethod
+    def none(cls, trains: int) -> Kick:
+        """An undisturbed step."""
+        return cls(np.zeros(trains), np.zeros(trains), np.zeros(trains))
+
+
+class Moved(NamedTuple):
+    """One step of all trains."""
+
+    own: Floats  # (n, 2) position [m] and speed [m/s] after the step
+    input: Floats  # (n,) applied input S_U[u + w3] during the step [m/s2]
+    displacement: Floats  # (n,) m, never negative
+    limited: Bools  # (n,) a clamp on input or speed acted
+    clipped: Bools  # (n,) the train would have moved backwards
+
+
+def constants(params: Params, consists: Consists, resistance_factor: Floats | None = None) -> Constants:
+    """Arrays of the plant; a train of several units gets the mean of their Davis coefficients, weighted by mass.
+
+    Parameters
+    ----------
+    params : Params
+        Clamps, the same for all trains.
+    consists : Consists
+        Units of all trains.
+    resistance_factor : ndarray, shape (n,), optional
+        True over believed resistance; 1 if left out.
+
+    Returns
+    -------
+    Constants
+    """
+    n = len(consists.first) - 1
+    weighted = np.add.reduceat(consists.mass[:, None] * consists.davis, consists.first[:-1])
+
+    def everywhere(value: float | None, otherwise: float) -> Floats:
+        return np.full(n, otherwise if value is None else value)
+
+    return Constants(
+        davis=weighted / consists.train_mass()[:, None],
+        resistance_factor=np.ones(n) if resistance_factor is None else resistance_factor,
+        input_lower=everywhere(params.input_lower_mps2, -np.inf),
+        input_upper=everywhere(params.input_upper_mps2, np.inf),
+        speed_lower=everywhere(params.speed_lower_mps, -np.inf),
+        speed_upper=everywhere(params.speed_upper_mps, np.inf),
+    )
+
+
+def resistance(speed: Floats, davis: Floats) -> Floats:
+    """Specific running resistance, Davis form ``c0 + c1 v + c2 v^2``: f of fully_distributed (1), r of robust_constrained (2).
+
+    Parameters
+    ----------
+    speed : ndarray, shape (n,)
+        Forward positive [m/s].
+    davis : ndarray, shape (n, 3)
+        c0 [N/kg], c1 [N s/(m kg)], c2 [N s2/(m2 kg)].
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Decelerating force per mass [N/kg].
+
+    Notes
+    -----
+    As printed, so ``c0`` acts at standstill too: a clamp of the speed at 0 keeps a stopped train where it is.
+    """
+    return davis[:, 0] + davis[:, 1] * speed + davis[:, 2] * speed**2
+
+
+def lead(steps: int) -> float:
+    """Theta of this plant when an acceleration is held for ``steps`` steps: ``(1 - 1/m) / 2``; 0 for the papers' m = 1.
+
+    Theta is defined by ``x(k+1) = x + ((1 - theta) v(k) + theta v(k+1)) T_c``; m Euler steps of T_c / m under constant
+    acceleration move ``v T_c + (1 - 1/m) / 2 (v(k+1) - v) T_c``.
+    """
+    return (1.0 - 1.0 / steps) / 2.0
+
+
+def advance(constants: Constants, own: Floats, acceleration: Floats, step: float, kick: Kick) -> Moved:
+    """One step of all trains: fully_distributed (1); with disturbances and clamps robust_constrained (4).
+
+    Parameters
+    ----------
+    constants : Constants
+        The plant.
+    own : ndarray, shape (n, 2)
+        Position [m] and speed [m/s].
+    acceleration : ndarray, shape (n,)
+        Demanded acceleration [m/s2]; the input asked for is this plus the resistance the train believes in.
+    step : float
+        T [s].
+    kick : Kick
+        Disturbances of this step.
+
+    Returns
+    -------
+    Moved
+
+    Notes
+    -----
+    The order of (4): add w3, clamp the input, subtract the true resistance, add w2, clamp the speed. Departs from both papers
+    in one thing: a displacement below zero is clipped to 0, since trains on a network do not run backwards.
+    """
+    x, v = own[:, POSITION], own[:, SPEED]
+    believed = resistance(v, constants.davis)
+    asked = believed + acceleration + kick.input
+    applied = np.clip(asked, constants.input_lower, constants.input_upper)
+    free = v + applied * step - constants.resistance_factor * believed * step + kick.speed
+    v_next = np.clip(free, constants.speed_lower, constants.speed_upper)
+    moved = v * step + kick.position
+    displacement = np.maximum(moved, 0.0)
+    return Moved(
+        own=np.column_stack((x + displacement, v_next)),
+        input=applied,
+        displacement=displacement,
+        limited=(applied != asked) | (v_next != free),
+        clipped=moved < 0.0,
+    )
