@@ -72,26 +72,29 @@ def standard_tables(
     train_extras, unit_extras : sequence of str
         Further columns of numbers: ``ENERGIES``, disturbances; any of ``UNIT_EXTRAS``.
     """
-    floats = dict.fromkeys
     tables: dict[str, Columns] = {
         "trains": {
             "time_s": "float", "train": trains, "track": tracks, "edge": edges,
-            **floats(("position_m", "speed_mps", "input_mps2", "spacing_m", "gap_m"), "float"), "saturated": "bool",
-            **floats((f"{name}_{end}" for name in watched for end in ("min", "max")), "float"),
-            **floats(train_extras, "float"),
+            **_floats(("position_m", "speed_mps", "input_mps2", "spacing_m", "gap_m")), "saturated": "bool",
+            **_floats(f"{name}_{end}" for name in watched for end in ("min", "max")),
+            **_floats(train_extras),
         },
         "links": {
             "time_s": "float", "sender": trains, "receiver": trains,
-            **floats(("spacing_m", "desired_m", "lower_m", "upper_m"), "float"), "heard": "bool",
+            **_floats(("spacing_m", "desired_m", "lower_m", "upper_m")), "heard": "bool",
         },
     }  # fmt: skip
     if units:
         numbers = ("position_m", "speed_mps", "force_n", "coupler_m", "coupler_force_n")
         extremes = ("coupler_min_m", "coupler_max_m", "force_min_n", "force_max_n")
         tables["units"] = {
-            "time_s": "float", "train": trains, "unit": "int", **floats((*numbers, *extremes, *unit_extras), "float"),
+            "time_s": "float", "train": trains, "unit": "int", **_floats((*numbers, *extremes, *unit_extras)),
         }  # fmt: skip
     return tables
+
+
+def _floats(names: Iterable[str]) -> dict[str, Column]:
+    return dict.fromkeys(names, "float")
 
 
 class Recorder:
@@ -243,7 +246,7 @@ class _Stream:
     def __init__(self, path: Path, columns: Columns, metadata: Mapping[str, str], group_rows: int) -> None:
         self.path, self.columns, self.group_rows = path, columns, group_rows
         self.rows = self.filled = 0
-        self.buffers = {
+        self.buffers: dict[str, NDArray[Any]] = {
             name: np.empty(group_rows, dtype=_DTYPES[column] if isinstance(column, str) else np.int32)
             for name, column in columns.items()
         }
