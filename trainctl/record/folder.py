@@ -26,7 +26,7 @@ INFO = "run.json"
 
 def partial_of(folder: Path) -> Path:
     """``DIR.partial`` of ``DIR``: where a run works until it is complete."""
-    return folder.with_name(folder.name + ".partial")
+    return folder.parent / f"{folder.name}.partial"
 
 
 def ours(folder: Path) -> bool:
@@ -60,7 +60,7 @@ def claim(folder: Path | str, force: bool = False) -> Path:
     folder = Path(os.path.abspath(folder))
     partial = partial_of(folder)
     for place in (folder, partial):
-        if place == Path.cwd() or place in Path.cwd().parents or not folder.name:
+        if place == Path.cwd() or place in Path.cwd().parents:
             raise InputError(f"{place}: holds the current directory: choose another --out")
         if not (free(place) or ours(place) or force):
             raise InputError(f"{place}: exists and is not a run of trainctl: choose another --out, or --force to replace it")
