@@ -180,11 +180,8 @@ def _train_davis(consists: Consists) -> Floats:
 
 
 def _resistance_range(davis: Floats, rho: Floats, Rho: Floats) -> tuple[Floats, Floats]:
-    """Least and greatest resistance on [rho, Rho], (n,) each: at an end or at the parabola's vertex."""
-    bent = davis[:, 2] != 0.0
-    vertex = np.where(bent, -davis[:, 1] / (2 * np.where(bent, davis[:, 2], 1.0)), rho)
-    at = np.array([_resistance(v, davis) for v in (rho, Rho, np.clip(vertex, rho, Rho))])
-    return at.min(axis=0), at.max(axis=0)
+    """Least and greatest resistance on [rho, Rho], (n,) each. No coefficient is negative, so it grows with the speed."""
+    return _resistance(rho, davis), _resistance(Rho, davis)
 
 
 # What must hold before the law may be used
@@ -213,48 +210,57 @@ def _per_train(scene: Scene, bad: Bools, texts: list[str]) -> Iterator[str]:
 
 def _speed_violations(scene: Scene) -> Iterator[str]:
     """v_i(0) in its band, Assumptions 2.3 and 2.4."""
-    rho, Rho, mu, Mu = scene.bounds
-    T, n = scene.control_period, len(scene.trains)
-    finite = True
+    rho, Rho = scene.bounds.speed_lower, scene.bounds.speed_upper
     for key, value in (("speed_lower_mps", rho), ("speed_upper_mps", Rho)):
-        unbounded = ~np.isfinite(value)
-        finite &= not unbounded.any()
-        yield from _per_train(scene, unbounded, [f"{key} = {u:g}: this law needs a finite bound (Assumption 2.3)" for u in value])
-    if not finite:
+        yield from _per_train(scene, ~np.isfinite(value), [f"{key} = {u:g}: needs a finite bound (Assumption 2.3)" for u in value])
+    if not np.isfinite([rho, Rho]).all():
         return
 
     v = scene.own[scene.consists.first[:-1], SPEED]
-    for i in np.flatnonzero(v < rho - ROUNDING).tolist():
-        yield f"train[{scene.trains[i]}].speed_mps = {v[i]:.10g}: below speed_lower_mps = {rho[i]:.10g}"
-    for i in np.flatnonzero(v > Rho + ROUNDING).tolist():
-        yield f"train[{scene.trains[i]}].speed_mps = {v[i]:.10g}: above speed_upper_mps = {Rho[i]:.10g}"
+    for i, name in enumerate(scene.trains):
+        if v[i] < rho[i] - ROUNDING:
+            yield f"train[{name}].speed_mps = {v[i]:.10g}: below speed_lower_mps = {rho[i]:.10g}"
+        if v[i] > Rho[i] + ROUNDING:
+            yield f"train[{name}].speed_mps = {v[i]:.10g}: above speed_upper_mps = {Rho[i]:.10g}"
 
     slow, fast = _speed_range(scene.reference, scene.time)
     low = [f"speed_lower_mps = {u:.10g}: must be below the reference speed {slow:.10g} m/s (Assumption 2.3)" for u in rho]
     high = [f"speed_upper_mps = {u:.10g}: must be above the reference speed {fast:.10g} m/s (Assumption 2.3)" for u in Rho]
     yield from _per_train(scene, rho >= slow, low)
     yield from _per_train(scene, Rho <= fast, high)
+    yield from _input_violations(scene, slow, fast)
 
+
+def _input_violations(scene: Scene, slow: float, fast: float) -> Iterator[str]:
+    """Assumption 2.4 for reference speeds from ``slow`` to ``fast`` [m/s]."""
+    rho, Rho, mu, Mu = scene.bounds
+    T = scene.control_period
     f, F = _resistance_range(_train_davis(scene.consists), rho, Rho)
     brakes, pulls = mu < f, F < Mu
-    low = [f"input_lower_mps2 = {mu[i]:.10g}: must be below the least running resistance {f[i]:.6g} m/s2 between "
-           f"{rho[i]:.10g} and {Rho[i]:.10g} m/s (Assumption 2.4)" for i in range(n)]  # fmt: skip
-    high = [f"input_upper_mps2 = {Mu[i]:.10g}: must be above the greatest running resistance {F[i]:.6g} m/s2 between "
-            f"{rho[i]:.10g} and {Rho[i]:.10g} m/s (Assumption 2.4)" for i in range(n)]  # fmt: skip
-    yield from _per_train(scene, ~brakes, low)
-    yield from _per_train(scene, ~pulls, high)
-
-    down, up = f - (Rho - slow) / T, F + (fast - rho) / T
     cure = ""
     if brakes.all() and pulls.all():
         period = max(np.max((Rho - slow) / (f - mu)), np.max((fast - rho) / (Mu - F)))
         cure = f", or run.control_period_s above {period:.6g}"
-    low = [f"input_lower_mps2 = {mu[i]:.10g}: must be below {down[i]:.6g} to brake from {Rho[i]:.10g} to {slow:.10g} m/s within "
-           f"one control period of {T:.10g} s{cure} (Assumption 2.4)" for i in range(n)]  # fmt: skip
-    high = [f"input_upper_mps2 = {Mu[i]:.10g}: must be above {up[i]:.6g} to accelerate from {rho[i]:.10g} to {fast:.10g} m/s within "
-            f"one control period of {T:.10g} s{cure} (Assumption 2.4)" for i in range(n)]  # fmt: skip
-    yield from _per_train(scene, brakes & (mu >= down), low)
-    yield from _per_train(scene, pulls & (Mu <= up), high)
+
+    def to_brake(i: int) -> str:
+        key = f"input_lower_mps2 = {mu[i]:.10g}"
+        if not brakes[i]:
+            return f"{key}: must be below the least running resistance, {f[i]:.6g} m/s2 at {rho[i]:.10g} m/s (Assumption 2.4)"
+        need = f[i] - (Rho[i] - slow) / T
+        span = f"from {Rho[i]:.10g} to {slow:.10g} m/s within one control period of {T:.10g} s"
+        return f"{key}: must be below {need:.6g} to brake {span}{cure} (Assumption 2.4)"
+
+    def to_pull(i: int) -> str:
+        key = f"input_upper_mps2 = {Mu[i]:.10g}"
+        if not pulls[i]:
+            return f"{key}: must be above the greatest running resistance, {F[i]:.6g} m/s2 at {Rho[i]:.10g} m/s (Assumption 2.4)"
+        need = F[i] + (fast - rho[i]) / T
+        span = f"from {rho[i]:.10g} to {fast:.10g} m/s within one control period of {T:.10g} s"
+        return f"{key}: must be above {need:.6g} to speed up {span}{cure} (Assumption 2.4)"
+
+    trains = range(len(scene.trains))
+    yield from _per_train(scene, ~brakes | (Rho - slow >= (f - mu) * T), [to_brake(i) for i in trains])
+    yield from _per_train(scene, ~pulls | (fast - rho >= (Mu - F) * T), [to_pull(i) for i in trains])
 
 
 def _speed_range(reference: Reference, time: float) -> tuple[float, float]:
