@@ -1,0 +1,22 @@
+"""Rail networks for SUMO: line descriptions, the builder, the line coordinate."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+
+from sumo_net.build import build
+from sumo_net.layout import Gradient
+from sumo_net.line import Line, LineCrossover
+from sumo_net.spec import Crossover, LineError, LineSpec, RegularCrossovers, parse_spec, read_spec
+
+__all__ = [
+    "Crossover", "Gradient", "Line", "LineCrossover", "LineError", "LineSpec", "RegularCrossovers",
+    "build", "parse_spec", "read_spec", "shipped",
+]  # fmt: skip
+
+
+def shipped() -> dict[str, Path]:
+    """The line descriptions that come with the package: name to file."""
+    folder = Path(str(files("sumo_net"))) / "lines"
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}

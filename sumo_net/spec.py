@@ -1,0 +1,376 @@
+"""What a line is: parallel tracks, crossovers, speed and gradient profiles, read from a TOML file.
+
+A line has one kilometrage for all its tracks, increasing in the direction of travel and measured along the rail. The
+README of this folder shows every key.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+#: Distance between the centres of neighbouring tracks [m].
+TRACK_SPACING_M = 4.5
+
+#: No edge is shorter than this [m]: two switches, or a switch and a speed change, lie at one place or this far apart.
+SHORTEST_EDGE_M = 1.0
+
+#: A crossover is at least this much longer than it moves sideways: 1 in 7 is about the sharpest switch of a main line.
+SHARPEST_SWITCH = 7.0
+
+#: A line with more edges than this is a mistake in max_edge_m or every_m.
+MOST_EDGES = 100_000
+
+
+class LineError(Exception):
+    """A line description or a net file is wrong. ``mistakes`` has one line each: ``file: key = value: rule``."""
+
+    def __init__(self, mistakes: Sequence[str]) -> None:
+        self.mistakes = list(mistakes)
+        super().__init__("\n".join(self.mistakes))
+
+
+def rounded(metres: float) -> float:
+    """Positions and lengths are kept to a micrometre, so that what the net file says is exactly what we compute."""
+    return round(metres, 6)
+
+
+def text(number: float) -> str:
+    """Shortest decimal notation to a micrometre: ids and attributes of the net."""
+    return f"{number:.6f}".rstrip("0").rstrip(".")
+
+
+def _word(value: Any) -> Any:
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+def _allowed(characters: str) -> AfterValidator:
+    def check(value: str) -> str:
+        if value and all(c.isascii() and c.isalnum() or c in characters for c in value) and value[0].isalnum():
+            return value
+        raise ValueError("must be letters, digits" + "".join(f" or {c}" for c in characters) + ", and begin with a letter or digit")
+
+    return AfterValidator(check)
+
+
+def _pair(value: Any) -> Any:
+    if isinstance(value, list | tuple) and len(value) == 2:
+        return tuple(value)
+    raise ValueError("must be a pair [from_m, value]")
+
+
+TrackId = Annotated[str, BeforeValidator(_word), _allowed(".")]
+Word = Annotated[str, BeforeValidator(_word), _allowed("_-.")]
+Speed = Annotated[float, Field(gt=0, le=200)]
+SpeedFrom = Annotated[tuple[Annotated[float, Field(ge=0)], Speed], BeforeValidator(_pair)]
+GradientFrom = Annotated[tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=-50, le=50)]], BeforeValidator(_pair)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
+
+
+class Crossover(_Strict):
+    """[[crossover]]: a one-way connection from one track to another, as long as the piece of track beside it."""
+
+    id: Word | None = Field(None, description="Name for events and routes; default xFROM-TO_POSITION, the id of its edge.")
+    from_track: TrackId = Field(alias="from", description="Track it leaves.")
+    to_track: TrackId = Field(alias="to", description="Track it leads to, and belongs to.")
+    position_m: float = Field(ge=0, description="Kilometrage of its switch on the track it leaves [m].")
+    length_m: float = Field(gt=0, description="Kilometrage from the switch to where it joins the other track [m].")
+    speed_mps: Speed = Field(description="Speed limit on it [m/s].")
+
+    @property
+    def edge(self) -> str:
+        """Id of its edge in the net."""
+        return f"x{self.from_track}-{self.to_track}_{text(self.position_m)}"
+
+    @property
+    def name(self) -> str:
+        """Its id, or that of its edge."""
+        return self.edge if self.id is None else self.id
+
+    @property
+    def start_m(self) -> float:
+        """Where it begins on the kilometrage [m]."""
+        return rounded(self.position_m)
+
+    @property
+    def end_m(self) -> float:
+        """Where it ends on the kilometrage [m]."""
+        return rounded(self.position_m + self.length_m)
+
+
+class RegularCrossovers(_Strict):
+    """[regular_crossovers]: both ways between all neighbouring tracks, at equal distances."""
+
+    every_m: float = Field(gt=0, description="Distance from one place to the next [m].")
+    first_m: float = Field(ge=0, description="Kilometrage of the first place [m].")
+    length_m: float = Field(gt=0, description="As in [[crossover]] [m].")
+    speed_mps: Speed = Field(description="Speed limit on them [m/s].")
+
+
+class LineSpec(_Strict):
+    """A line, as its TOML file describes it."""
+
+    name: Word = Field(description="Name of the line; its files are called so.")
+    tracks: Annotated[tuple[TrackId, ...], Field(strict=False)] = Field(
+        min_length=1, description="Track ids in lateral order, left to right in the direction of travel."
+    )
+    length_m: float = Field(gt=0, le=1e7, description="Length of the line [m].")
+    start_m: float = Field(0.0, ge=0, le=1e7, description="Kilometrage of its beginning [m], not negative.")
+    max_edge_m: float = Field(5000.0, ge=10, description="No edge of a track is longer than this [m].")
+    speed: Annotated[tuple[SpeedFrom, ...], Field(strict=False)] = Field(
+        min_length=1, description="Speed limit: pairs [from_m, speed_mps], the first at start_m."
+    )
+    gradient: Annotated[tuple[GradientFrom, ...], Field(strict=False)] = Field(
+        (), description="Gradient: pairs [from_m, permil], rising positive, within 50 per mil; level before the first."
+    )
+    crossover: Annotated[tuple[Crossover, ...], Field(strict=False)] = Field((), description="Crossovers, one by one.")
+    regular_crossovers: RegularCrossovers | None = Field(None, description="Crossovers at equal distances.")
+
+    @property
+    def begin_m(self) -> float:
+        """Kilometrage of the beginning [m]."""
+        return rounded(self.start_m)
+
+    @property
+    def end_m(self) -> float:
+        """Kilometrage of the end [m]."""
+        return rounded(self.start_m + self.length_m)
+
+    def all_crossovers(self) -> list[Crossover]:
+        """The crossovers of the list, then the regular ones, which end before the line does."""
+        return [*self.crossover, *self._regular()]
+
+    def _regular(self) -> Iterator[Crossover]:
+        r = self.regular_crossovers
+        if r is None:
+            return
+        pairs = [pair for a, b in zip(self.tracks, self.tracks[1:], strict=False) for pair in ((a, b), (b, a))]
+        k = 0
+        while (at := rounded(r.first_m + k * r.every_m)) + r.length_m <= self.end_m - SHORTEST_EDGE_M:
+            for here, there in pairs:
+                place = {"position_m": at, "length_m": r.length_m, "speed_mps": r.speed_mps}
+                yield Crossover.model_validate({"from": here, "to": there} | place)
+            k += 1
+
+    def cuts(self) -> dict[str, dict[float, str]]:
+        """Where each track must be cut into edges, and why: ends of the line, speed changes, both ends of crossovers."""
+        common = {rounded(at): f"the speed change at {text(at)} m" for at, _ in self.speed}
+        common |= {self.begin_m: "the beginning of the line", self.end_m: "the end of the line"}
+        found = {track: dict(common) for track in self.tracks}
+        for c in self.all_crossovers():
+            found[c.from_track].setdefault(c.start_m, f"the switch of {c.name} at {text(c.start_m)} m")
+            found[c.to_track].setdefault(c.end_m, f"the end of {c.name} at {text(c.end_m)} m")
+        return found
+
+
+def read_spec(path: str | Path) -> LineSpec:
+    """The line described by a TOML file.
+
+    Raises
+    ------
+    LineError
+        With every mistake in the file.
+    """
+    path = Path(path)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise LineError([f"{path}: no such file"]) from None
+    except OSError as error:
+        raise LineError([f"{path}: cannot be read: {error.strerror}"]) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise LineError([f"{path}: not TOML: {error}"]) from None
+    return parse_spec(data, str(path))
+
+
+def parse_spec(data: dict[str, Any], file: str) -> LineSpec:
+    """The line described by the tables of a TOML file; ``file`` is its name for messages."""
+    found: list[str] = []
+    spec: LineSpec | None
+    numbers = list(range(1, len(data["crossover"]) + 1)) if isinstance(data.get("crossover"), list) else []
+    try:
+        spec = LineSpec.model_validate(data)
+    except ValidationError as error:
+        found = _words(error)
+        spec, numbers = _healthy_part(error, data, numbers)
+    if spec is not None:
+        found += violations(spec, numbers)
+    if found or spec is None:
+        raise LineError([f"{file}: {line}" for line in found])
+    return spec
+
+
+def _key(location: Sequence[int | str]) -> str:
+    """Dotted key; items of lists by number from 1."""
+    key = ""
+    for part in location:
+        key += f"[{part + 1}]" if isinstance(part, int) else f".{part}" if key else part
+    return key
+
+
+_TABLES: dict[str, type[BaseModel]] = {"crossover": Crossover, "regular_crossovers": RegularCrossovers}
+
+
+def _words(error: ValidationError) -> list[str]:
+    lines = []
+    for e in error.errors(include_url=False):
+        key, value = _key(e["loc"]), e["input"]
+        if e["type"] == "extra_forbidden":
+            table = _TABLES.get(str(e["loc"][0]), LineSpec)
+            known = [f.alias or name for name, f in table.model_fields.items()]
+            near = difflib.get_close_matches(str(e["loc"][-1]), known, n=1)
+            lines.append(f"{key}: unknown key" + (f"; did you mean {near[0]}?" if near else "") + f"; known: {', '.join(known)}")
+        elif e["type"] == "missing":
+            lines.append(f"{key}: missing")
+        else:
+            rule = str(e["ctx"]["error"]) if e["type"] == "value_error" else e["msg"].replace("Input should", "must", 1)
+            shown = "a table" if isinstance(value, dict) else value
+            lines.append(f"{key} = {shown}: {rule[0].lower()}{rule[1:]}")
+    return lines
+
+
+def _healthy_part(error: ValidationError, data: dict[str, Any], numbers: list[int]) -> tuple[LineSpec | None, list[int]]:
+    """The line without what is wrong in itself, so that mistakes between keys are found too; None if too little is left."""
+    rest = {key: list(value) if isinstance(value, list) else value for key, value in data.items()}
+    bad: set[int] = set()
+    for e in error.errors(include_url=False):
+        key = e["loc"][0]
+        if key == "crossover" and len(e["loc"]) > 1 and isinstance(e["loc"][1], int):
+            bad.add(e["loc"][1])
+        else:
+            rest.pop(str(key), None)
+    if "crossover" in rest:
+        rest["crossover"] = [c for k, c in enumerate(rest["crossover"]) if k not in bad]
+        numbers = [n for k, n in enumerate(numbers) if k not in bad]
+    try:
+        return LineSpec.model_validate({"name": "line", "speed": [[rest.get("start_m", 0.0), 1.0]]} | rest), numbers
+    except ValidationError:
+        return None, []
+
+
+def violations(spec: LineSpec, numbers: Sequence[int] = ()) -> list[str]:
+    """Every mistake that lies between the keys of a line, as ``key = value: rule``; ``numbers`` names unnamed crossovers."""
+    found = [f"tracks = {t}: stands more than once" for t in dict.fromkeys(spec.tracks) if spec.tracks.count(t) > 1]
+    found += _profile_violations(spec)
+    found += _regular_violations(spec)
+    own = [_crossover_violations(spec, label, c) for label, c in _labelled(spec, numbers)]
+    found += [line for lines in own for line in lines]
+    if found or (many := _too_many(spec)):
+        return found or many
+    found += _meeting_violations(spec, numbers)
+    return found or _close_cuts(spec)
+
+
+def _labelled(spec: LineSpec, numbers: Sequence[int]) -> list[tuple[str, Crossover]]:
+    numbers = numbers or range(1, len(spec.crossover) + 1)
+    return [(f"crossover[{n if c.id is None else c.id}]", c) for n, c in zip(numbers, spec.crossover, strict=True)]
+
+
+def _profile_violations(spec: LineSpec) -> list[str]:
+    found = []
+    line = f"the line ({text(spec.begin_m)} to {text(spec.end_m)} m)"
+    if rounded(spec.speed[0][0]) != spec.begin_m:
+        found.append(f"speed[1] = {list(spec.speed[0])}: must begin where the line does, at start_m = {text(spec.begin_m)}")
+    for key, profile in (("speed", spec.speed), ("gradient", spec.gradient)):
+        for k, (at, value) in enumerate(profile, 1):
+            if not spec.begin_m <= rounded(at) < spec.end_m and not (key == "speed" and k == 1):
+                found.append(f"{key}[{k}] = {[at, value]}: lies outside {line}")
+            if k > 1 and at <= profile[k - 2][0]:
+                found.append(f"{key}[{k}] = {[at, value]}: from_m must increase, the one before is at {text(profile[k - 2][0])}")
+    return found
+
+
+def _regular_violations(spec: LineSpec) -> list[str]:
+    r = spec.regular_crossovers
+    if r is None:
+        return []
+    found = []
+    if len(spec.tracks) < 2:
+        found.append("regular_crossovers: a line of one track has none")
+    if r.length_m < SHARPEST_SWITCH * TRACK_SPACING_M:
+        found.append(f"regular_crossovers.length_m = {r.length_m:g}: must be at least {_sharpness(TRACK_SPACING_M)}")
+    if r.every_m < r.length_m + SHORTEST_EDGE_M:
+        rule = f"must be longer than length_m = {r.length_m:g} by {SHORTEST_EDGE_M:g} m"
+        found.append(f"regular_crossovers.every_m = {r.every_m:g}: {rule}")
+    if not spec.begin_m + SHORTEST_EDGE_M <= r.first_m <= spec.end_m - r.length_m - SHORTEST_EDGE_M:
+        rule = f"the first lies not wholly inside the line, {text(spec.begin_m)} to {text(spec.end_m)} m"
+        found.append(f"regular_crossovers.first_m = {text(r.first_m)}: {rule}")
+    return found
+
+
+def _crossover_violations(spec: LineSpec, label: str, c: Crossover) -> list[str]:
+    found = [
+        f"{label}.{key} = {track}: no such track; there are: {', '.join(spec.tracks)}"
+        for key, track in (("from", c.from_track), ("to", c.to_track))
+        if track not in spec.tracks
+    ]
+    if c.from_track == c.to_track:
+        found.append(f"{label}.to = {c.to_track}: leads from a track to itself")
+    elif not found:
+        sideways = TRACK_SPACING_M * abs(spec.tracks.index(c.from_track) - spec.tracks.index(c.to_track))
+        if c.length_m < SHARPEST_SWITCH * sideways:
+            found.append(f"{label}.length_m = {c.length_m:g}: must be at least {_sharpness(sideways)}")
+    key = f"{label}.position_m = {text(c.position_m)}"
+    if c.start_m < spec.begin_m + SHORTEST_EDGE_M:
+        found.append(f"{key}: must lie inside the line, which begins at {text(spec.begin_m)} m")
+    if c.end_m > spec.end_m - SHORTEST_EDGE_M:
+        found.append(f"{key}: ends at {text(c.end_m)} m, must lie wholly inside the line, which ends at {text(spec.end_m)} m")
+    return found
+
+
+def _sharpness(sideways: float) -> str:
+    return f"{SHARPEST_SWITCH * sideways:g} m to reach a track {sideways:g} m beside"
+
+
+def _too_many(spec: LineSpec) -> list[str]:
+    edges = len(spec.tracks) * math.ceil(spec.length_m / spec.max_edge_m)
+    found = []
+    if edges > MOST_EDGES:
+        found.append(f"max_edge_m = {spec.max_edge_m:g}: cuts the line into {edges} edges, at most {MOST_EDGES}")
+    if (r := spec.regular_crossovers) and (count := 2 * (len(spec.tracks) - 1) * spec.length_m / r.every_m) > MOST_EDGES:
+        found.append(f"regular_crossovers.every_m = {r.every_m:g}: makes {count:.0f} crossovers, at most {MOST_EDGES}")
+    return found
+
+
+def _meeting_violations(spec: LineSpec, numbers: Sequence[int]) -> list[str]:
+    """Two crossovers with one name, or that lie on top of each other."""
+    found = []
+    listed = _labelled(spec, numbers)
+    everything = listed + [(f"regular_crossovers ({c.name})", c) for c in spec._regular()]
+    first: dict[str, str] = {}
+    for label, c in everything:
+        # An unnamed crossover carries the name of its edge, which another one with the same edge repeats: reported below.
+        for name in dict.fromkeys((c.name, c.edge)):
+            if name in first and c.id is not None and name == c.id:
+                found.append(f"{label}.id = {c.id}: is already the name of {first[name]}")
+            first.setdefault(name, label)
+    ways: dict[tuple[str, str], list[tuple[float, float, str]]] = {}
+    for label, c in everything:
+        ways.setdefault((c.from_track, c.to_track), []).append((c.start_m, c.end_m, label))
+    for (here, there), pieces in ways.items():
+        pieces.sort()
+        for (start, end, label), (next_start, _, other) in zip(pieces, pieces[1:], strict=False):
+            if next_start < end:
+                what = "is the same as" if next_start == start else "overlaps"
+                found.append(f"{other}: {what} {label}, also from {here} to {there}, at {text(start)} to {text(end)} m")
+    return found
+
+
+def _close_cuts(spec: LineSpec) -> list[str]:
+    found = []
+    for track, reasons in spec.cuts().items():
+        places = sorted(reasons)
+        for a, b in zip(places, places[1:], strict=False):
+            if rounded(b - a) < SHORTEST_EDGE_M:
+                rule = f"must be one place or at least {SHORTEST_EDGE_M:g} m apart, not {text(b - a)} m"
+                found.append(f"tracks = {track}: {reasons[a]} and {reasons[b]}: {rule}")
+    return list(dict.fromkeys(found))
