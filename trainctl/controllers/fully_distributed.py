@@ -310,7 +310,7 @@ def _link_violations(scene: Scene) -> Iterator[str]:
             yield f"{name}.lower_m = {lower:.10g}: must be below desired_m = {d:.10g} (Assumption 2.2)"
         if not d < upper:
             yield f"{name}.upper_m = {upper:.10g}: must be above desired_m = {d:.10g} (Assumption 2.2)"
-        if 0.0 < d and lower < length[j]:
+        if 0.0 < d and lower < length[j] and length[j] > 0.0:
             yield f"{name}.lower_m = {lower:.10g}: spacing is front to front, and train {scene.trains[j]} is {length[j]:.10g} m"
     yield from _cycle_violations(scene)
 
