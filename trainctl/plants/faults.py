@@ -31,12 +31,12 @@ class Fault(Table):
     train: Annotated[int | str, AfterValidator(str)] = Field(description="Id of the train.")
     unit: int = Field(ge=1, description="Unit of the train, 1 is the head.")
     kind: Literal["constant", "sinusoid", "effectiveness"] = Field(
-        description="constant: rate amplitude_n_per_s; sinusoid: amplitude_n_per_s cos(omega_rad_per_s t + phase_rad), t scenario time; "
-        "effectiveness: share of the demanded force that the actuator gives."
+        description="constant: rate amplitude_n_per_s; sinusoid: amplitude_n_per_s cos(omega_rad_per_s t + phase_rad), t from the "
+        "start of the run; effectiveness: share of the demanded force that the actuator gives."
     )
     start_s: float = Field(0.0, ge=0, description="First instant of the window [s].")
     end_s: float | None = Field(None, description="End of the window [s]; default the end of the run.")
-    amplitude_n_per_s: float | None = Field(None, description="Rate at which the fault pushes the force, E f [N/s]; the bias is this / r.")
+    amplitude_n_per_s: float | None = Field(None, description="Rate E f of the force [N/s]; the bias is this / r.")
     omega_rad_per_s: float | None = Field(None, gt=0, description="Angular frequency [rad/s].")
     phase_rad: float | None = Field(None, description="Phase at scenario time 0 [rad].")
     effectiveness: float | None = Field(None, ge=0, le=1, description="1: sound; 0: total loss [-].")

@@ -1,0 +1,364 @@
+"""Asymptotical cooperative cruise fault-tolerant control with barrier functions: eqs. (29)-(39) of [1]_.
+
+The head of each train follows the tail of the train ahead inside given bounds of distance and speed difference (first train: the
+virtual leader at its slot); every further carriage follows the one in front of it. The law is evaluated together with an observer
+(``asymptotic`` or ``intermediate``), whose right-hand sides it cancels: it reads only ``estimate`` columns x, v, w and
+``correction``, so any observer of that form serves.
+
+Symbols
+-------
+=====================  =======================================================================================================
+x0, v0, w0, u0         the virtual leader: position [m], speed [m/s], acceleration [m/s2], jerk [m/s3]
+xt, vt, wt             x tilde, v tilde [m, m/s] from measurements and w tilde [m/s2] from estimates: predecessor minus self
+rho1, rho2             R2: -rho2 < xt < rho1 [m]
+sigma1, sigma2         R3: -sigma2 < vt < sigma1 [m/s]
+qt                     vt + ell1 xt [m/s]
+varrho1, varrho2       R3': -varrho2 < qt < varrho1 [m/s]
+phi, psi, Phi, Psi     barrier functions of xt, qt, eqs. (34), (35)
+beta1, beta2, G        eqs. (36), (37); G is what the predecessor's tail sends, w_hat'
+z1, z2, z3, l1, l2, l3 errors and gains of the carriages behind the head, eqs. (29)-(32); kappa = l1 + 1
+ell1 .. ell4           gains of the heads
+u                      jerk input [m/s3], eq. (5); the demand is the force varpi / r [N]
+=====================  =======================================================================================================
+
+Departures from [1]_, each shown in ``tests/paper/test_fault_tolerant.py``
+-------------------------------------------------------------------------------
+* (37) prints ``- ell4 beta2``. beta2 holds predecessor minus self, so (54) needs ``+``.
+* Section 5 swaps the values of varrho1 and varrho2; Remark 2.1 is used.
+* A head sends its train's tail moved to where the tail says the head is: spacings stay front to front, and epsilon = spacing minus
+  the length of the train ahead without its last carriage.
+* Close to a bound of qt the barrier is stiffer than any integrator (Theorem 2 holds in continuous time only). Where
+  ``(d beta1 / d vt)^2 h > 2`` it goes on with constant slope, so it stays finite there and outside; for h -> 0 it is the paper's.
+
+References
+----------
+.. [1] Zhang, Chen, "Asymptotical Cooperative Cruise Fault Tolerant Control for Multiple High-speed Trains with State
+   Constraints".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numba import njit
+from pydantic import Field
+
+from trainctl.signals import POSITION, SPEED, Floats, Ints, Links, Scene, Table, leader_at
+
+CLOCK: Literal["continuous"] = "continuous"
+ORDER: Literal["chain"] = "chain"
+MESSAGE = 4
+WATCHED = ("spacing_error_m", "speed_error_mps", "q_error_mps")
+
+#: Observers whose ``estimate`` and ``correction`` have the columns below.
+OBSERVERS = ("asymptotic", "intermediate")
+X, V, W = 0, 1, 2
+X_RATE, V_RATE, W_DRIFT, UNCOMPENSATED, STATIC = 0, 1, 2, 3, 4
+
+#: Classic Runge-Kutta is stable to 2.78; the rest is margin.
+STABLE = 2.5
+
+
+class Params(Table):
+    """Keys of ``[controller]`` with ``law = "fault_tolerant"``. Bounds of distance are those of the links."""
+
+    carriage_l1: float = Field(0.1, gt=0, description="l1, carriages behind the head, eq. (29)")
+    carriage_l2: float = Field(0.1, gt=0, description="l2, eq. (30)")
+    carriage_l3: float = Field(0.1, gt=0, description="l3, eq. (31)")
+    head_l1_per_s: float = Field(0.01, gt=0, description="ell1 of the heads [1/s]: distances settle with this rate, R3'")
+    head_l2: float = Field(2.1, gt=0, description="ell2, eq. (36); above 2")
+    head_l3: float = Field(4.3, gt=0, description="ell3, eq. (36); above 2 + ell2^2 / 2")
+    head_l4: float = Field(1.0, gt=0, description="ell4, eq. (37); above 1/2")
+    speed_error_lower_mps: float = Field(-50.0, lt=0, description="-sigma2: least speed difference to the train ahead [m/s], R3")
+    speed_error_upper_mps: float = Field(50.0, gt=0, description="sigma1: greatest speed difference to the train ahead [m/s], R3")
+    leader_error_lower_m: float = Field(-2351.0, lt=0, description="-rho2 of the train that follows the reference [m], R2")
+    leader_error_upper_m: float = Field(1947.0, gt=0, description="rho1 of the train that follows the reference [m], R2")
+
+
+class Constants(NamedTuple):
+    """The law's constants. Lower bounds are signed (-rho2, ...)."""
+
+    first: Ints  # (n + 1,)
+    length: Floats  # (U,) m, d_p behind each unit
+    inertia_per_rate: Floats  # (U,) kg s, m / r
+    offset: Floats  # (n,) m, front of the head to front of the tail at rest
+    distance: Floats  # (n, 2) m, -rho2, rho1
+    mixed: Floats  # (n, 2) m/s, -varrho2, varrho1
+    distance_kept: Floats  # (n, 2) m, the part of the range where the barrier is the printed one
+    mixed_kept: Floats  # (n, 2) m/s
+    l1: float
+    l2: float
+    l3: float
+    ell1: float
+    ell2: float
+    ell3: float
+    ell4: float
+
+
+def constants(params: Params, scene: Scene) -> Constants:
+    """Constants of the law; see ``ContinuousLaw``."""
+    c, links = scene.consists, scene.links
+    n = len(scene.trains)
+    distance = np.empty((n, 2))
+    for i in range(n):
+        rows = slice(links.first[i], links.first[i + 1])
+        k = ahead(links.desired[rows])
+        if k < 0:
+            distance[i] = params.leader_error_lower_m, params.leader_error_upper_m
+        else:
+            distance[i] = links.lower[rows][k] - links.desired[rows][k], links.upper[rows][k] - links.desired[rows][k]
+    mixed = np.array([mixed_bounds(params, *row) for row in distance])
+    return Constants(
+        first=c.first, length=c.length, inertia_per_rate=c.mass * c.rotating / c.actuator_rate,
+        offset=c.train_length() - c.length[c.first[1:] - 1],
+        distance=distance, mixed=mixed, distance_kept=0.999 * distance,
+        mixed_kept=np.array([resolved(params, row[0], row[1], scene.sub_step) for row in mixed]),
+        l1=params.carriage_l1, l2=params.carriage_l2, l3=params.carriage_l3,
+        ell1=params.head_l1_per_s, ell2=params.head_l2, ell3=params.head_l3, ell4=params.head_l4,
+    )  # fmt: skip
+
+
+def mixed_bounds(params: Params, lower: float, upper: float) -> tuple[float, float]:
+    """Bounds (-varrho2, varrho1) of qt [m/s] for bounds (-rho2, rho1) of xt [m]: Remark 2.1."""
+    varrho1 = params.speed_error_upper_mps + params.head_l1_per_s * lower
+    varrho2 = -params.speed_error_lower_mps - params.head_l1_per_s * upper
+    return -varrho2, varrho1
+
+
+def resolved(params: Params, lower: float, upper: float, step: float) -> tuple[float, float]:
+    """Part of (lower, upper) of qt in which a Runge-Kutta step [s] still resolves the barrier, ``(d beta1/d vt)^2 h <= 2``."""
+    if not (lower < 0.0 < upper and math.isfinite(lower) and math.isfinite(upper)):
+        return lower, upper
+    kept = []
+    for bound in (lower, upper):
+        inside, outside = 0.0, 0.999
+        for _ in range(40):
+            share = 0.5 * (inside + outside)
+            slope = params.head_l2 + params.head_l3 * barrier(share * bound, lower, upper, lower, upper)[1]
+            inside, outside = (share, outside) if slope * slope * step <= 2.0 else (inside, share)
+        kept.append(inside * bound)
+    return kept[0], kept[1]
+
+
+@njit(cache=True)
+def ahead(desired: Floats) -> int:
+    """Row of the nearest train ahead among the links of one train, -1 if it hears none from ahead."""
+    best = -1
+    for k in range(len(desired)):
+        if desired[k] > 0.0 and (best < 0 or desired[k] < desired[best]):
+            best = k
+    return best
+
+
+@njit(cache=True)
+def barrier(e: float, lower: float, upper: float, kept_lower: float, kept_upper: float) -> tuple[float, float]:
+    """Product phi Phi of eqs. (34), (35) at ``e`` and its derivative; outside (kept_lower, kept_upper) with constant slope."""
+    at = min(max(e, kept_lower), kept_upper)
+    below, above = at - lower, upper - at
+    log = math.log((below / -lower) / (above / upper))
+    both = 1.0 / below + 1.0 / above
+    slope = both * both + log * (1.0 / (above * above) - 1.0 / (below * below))
+    return log * both + slope * (e - at), slope
+
+
+@njit(cache=True)
+def demand(
+    i: int, constants: Constants, leader: Floats, age: float, slot: float, own: Floats, estimate: Floats, correction: Floats,
+    desired: Floats, heard: Floats, out: Floats,
+) -> None:  # fmt: skip
+    """Force of every carriage [N]: eqs. (29)-(37).
+
+    ``heard`` (k, 4) is what ``message`` wrote, relative to the leader; with ``age`` > 0 it is carried on with constant jerk.
+    """
+    c = constants
+    k = ahead(desired)
+    if k < 0:
+        x, v, w, G = leader[0] + slot, leader[1], leader[2], leader[3]
+    else:
+        dx, dv, dw, dG = heard[k, 0], heard[k, 1], heard[k, 2], heard[k, 3]
+        x = leader[0] - desired[k] + dx + age * (dv + age * (dw / 2.0 + age * dG / 6.0))
+        v = leader[1] + dv + age * (dw + age * dG / 2.0)
+        w, G = leader[2] + dw + age * dG, leader[3] + dG
+
+    xt, vt, wt = x - own[0, POSITION], v - own[0, SPEED], w - estimate[0, W]
+    qt = vt + c.ell1 * xt
+    phi_Phi, dphi_Phi = barrier(xt, c.distance[i, 0], c.distance[i, 1], c.distance_kept[i, 0], c.distance_kept[i, 1])
+    psi_Psi, dpsi_Psi = barrier(qt, c.mixed[i, 0], c.mixed[i, 1], c.mixed_kept[i, 0], c.mixed_kept[i, 1])
+    beta1 = -phi_Phi - c.ell2 * qt - c.ell3 * psi_Psi
+    beta1_v = -c.ell2 - c.ell3 * dpsi_Psi
+    beta1_x = -dphi_Phi + c.ell1 * beta1_v
+    beta2 = wt + c.ell1 * vt - beta1
+    # (37) prints -ell4 beta2; (54) needs +
+    w_rate = (
+        G + c.ell1 * wt + c.ell1 * c.ell1 * beta2 - beta1_x * vt - beta1_v * wt + beta1_v * beta1_v * beta2 + qt + c.ell4 * beta2
+    )
+    first = c.first[i]
+    for j in range(len(out)):
+        if j > 0:  # (29)-(32); w_rate is still that of the carriage in front
+            kappa, damping = c.l1 + 1.0, c.l2 + 1.0 + (c.l1 + 1.0) ** 2
+            z1 = estimate[j, X] - estimate[j - 1, X] + c.length[first + j - 1]
+            z2 = estimate[j, V] - estimate[j - 1, V] + kappa * z1
+            alpha2 = -z1 - damping * z2 - kappa * (estimate[j, V] - estimate[j - 1, V]) + estimate[j - 1, W]
+            z3 = estimate[j, W] - alpha2
+            w_rate += (
+                -c.l3 * z3 - z2
+                - (1.0 + damping * kappa) * (correction[j, X_RATE] - correction[j - 1, X_RATE])
+                - (damping + kappa) * (correction[j, V_RATE] - correction[j - 1, V_RATE])
+            )  # fmt: skip
+        u = w_rate - (correction[j, W_DRIFT] - correction[j, UNCOMPENSATED])  # (33), (37)
+        out[j] = correction[j, STATIC] + c.inertia_per_rate[first + j] * u  # (5), over r
+        w_rate += correction[j, UNCOMPENSATED]  # hat w' of (13) with this u
+
+
+@njit(cache=True)
+def message(
+    i: int, constants: Constants, leader: Floats, slot: float, own: Floats, estimate: Floats, estimate_rate: Floats, out: Floats
+) -> None:
+    """Send the tail's x (moved to the head), v, w_hat and w_hat' = g, all relative to the leader, shape (4,)."""
+    tail = len(own) - 1
+    out[0] = own[tail, POSITION] + constants.offset[i] - leader[0]
+    out[1] = own[tail, SPEED] - leader[1]
+    out[2] = estimate[tail, W] - leader[2]
+    out[3] = estimate_rate[tail, W] - leader[3]
+
+
+@njit(cache=True)
+def watch(i: int, constants: Constants, leader: Floats, first: Ints, own: Floats, links: Links, out: Floats) -> None:
+    """Write xt, vt, qt of train ``i`` (3,)."""
+    head, rows = first[i], slice(links.first[i], links.first[i + 1])
+    k = ahead(links.desired[rows])
+    if k < 0:
+        out[0] = leader[0] + links.slot[i] - own[head, POSITION]
+        out[1] = leader[1] - own[head, SPEED]
+    else:
+        j = links.sender[rows][k]
+        tail = first[j + 1] - 1
+        out[0] = own[tail, POSITION] + constants.offset[j] - own[head, POSITION] - links.desired[rows][k]
+        out[1] = own[tail, SPEED] - own[head, SPEED]
+    out[2] = out[1] + constants.ell1 * out[0]
+
+
+def inadmissible(params: Params, spacing_error: float, speed_error: float, lower: float, upper: float) -> list[str]:
+    """Reasons why a train may not begin to follow another now: start condition (39). Empty: it may.
+
+    The rule for joining: a train that comes from another track is linked as soon as this is empty for it and the train ahead
+    (``spacing_error`` and ``speed_error`` as ``errors`` gives them), and for the train behind and it. Until then it keeps its slot.
+
+    Parameters
+    ----------
+    params : Params
+        Of the law.
+    spacing_error : float
+        xt: spacing front to front, taken from the tail of the train ahead, minus the desired one [m].
+    speed_error : float
+        vt: speed of the tail of the train ahead minus own [m/s].
+    lower, upper : float
+        -rho2 and rho1: least and greatest spacing minus the desired one [m].
+    """
+    low, high = mixed_bounds(params, lower, upper)
+    q = speed_error + params.head_l1_per_s * spacing_error
+    found = []
+    if not lower < spacing_error < upper:
+        found.append(f"distance error {spacing_error:.6g} m is not between {lower:g} and {upper:g} m")
+    if not low < q < high:
+        found.append(
+            f"q = {speed_error:.6g} m/s + {params.head_l1_per_s:g}/s * {spacing_error:.6g} m = {q:.6g} m/s "
+            f"is not between {low:.6g} and {high:.6g} m/s"
+        )
+    return found
+
+
+def admissible(params: Params, spacing_error: float, speed_error: float, lower: float, upper: float) -> bool:
+    """Whether ``inadmissible`` finds nothing."""
+    return not inadmissible(params, spacing_error, speed_error, lower, upper)
+
+
+def errors(constants: Constants, scene: Scene) -> Floats:
+    """xt [m], vt [m/s], qt [m/s] of every train now, shape (n, 3)."""
+    leader, out = np.empty(4), np.empty((len(scene.trains), 3))
+    leader_at(scene.reference, scene.time, scene.time + 0.5 * scene.sub_step, leader)
+    for i in range(len(out)):
+        watch(i, constants, leader, scene.consists.first, scene.own, scene.links, out[i])
+    return out
+
+
+def violations(params: Params, scene: Scene) -> list[str]:
+    """Every assumption and start condition that fails: (38), (39), R3', links, the reference and the integrator's step."""
+    return [*_gains(params), *_links(params, scene), *_reference(scene), *_start(params, scene)]
+
+
+def _gains(params: Params) -> Iterator[str]:
+    """Conditions (38)."""
+    least = 2.0 + 0.5 * params.head_l2**2
+    if params.head_l2 <= 2.0:
+        yield f"controller.head_l2 = {params.head_l2:g}: must be above 2, condition (38)"
+    if params.head_l3 <= least:
+        yield f"controller.head_l3 = {params.head_l3:g}: must be above 2 + head_l2^2 / 2 = {least:g}, condition (38)"
+    if params.head_l4 <= 0.5:
+        yield f"controller.head_l4 = {params.head_l4:g}: must be above 1/2, condition (38)"
+
+
+def _links(params: Params, scene: Scene) -> Iterator[str]:
+    """Bounds of every pair and R3': 0 < ell1 < min(sigma2 / rho1, sigma1 / rho2)."""
+    links = scene.links
+    for i, train in enumerate(scene.trains):
+        rows = slice(links.first[i], links.first[i + 1])
+        if any(scene.consists.actuator_rate[u] <= 0.0 for u in range(scene.consists.first[i], scene.consists.first[i + 1])):
+            yield f"actuator_rate_per_s of train {train}: must be above 0, the law acts through the actuators"
+        k = ahead(links.desired[rows])
+        if k < 0:
+            lower, upper, pair = params.leader_error_lower_m, params.leader_error_upper_m, f"train {train} and the reference"
+            if math.isnan(links.slot[i]):
+                yield f"topology.desired: train {train} hears no train ahead and needs a slot behind the reference"
+        else:
+            desired = float(links.desired[rows][k])
+            lower, upper = float(links.lower[rows][k]) - desired, float(links.upper[rows][k]) - desired
+            pair = f"trains {scene.trains[links.sender[rows][k]]} and {train}"
+            if not (math.isfinite(lower) and math.isfinite(upper) and lower < 0.0 < upper):
+                yield (
+                    f"lower_m, upper_m of {pair} = {links.lower[rows][k]:g}, {links.upper[rows][k]:g}: "
+                    f"must be finite with the desired {desired:g} m between"
+                )
+                continue
+        most = min(-params.speed_error_lower_mps / upper, params.speed_error_upper_mps / -lower)
+        if params.head_l1_per_s >= most:
+            yield (
+                f"controller.head_l1_per_s = {params.head_l1_per_s:g}: must be below min(sigma2 / rho1, sigma1 / rho2) = "
+                f"{most:.4g} for {pair}, R3'"
+            )
+
+
+def _reference(scene: Scene) -> Iterator[str]:
+    """The law needs the leader's jerk: its speed must not step."""
+    sides = np.empty((2, 4))
+    for t in scene.reference.breaks[1:-1]:
+        leader_at(scene.reference, t, t - 1e-6, sides[0])
+        leader_at(scene.reference, t, t + 1e-6, sides[1])
+        step = sides[1, SPEED] - sides[0, SPEED]
+        if abs(step) > 1e-6:
+            yield f"reference: its speed steps by {step:g} m/s at {t:g} s; this law follows only speeds without steps"
+
+
+def _start(params: Params, scene: Scene) -> Iterator[str]:
+    """(39) for every train, then whether the integrator's step resolves the loop."""
+    c, h = scene.consists, scene.sub_step
+    known = constants(params, scene)
+    rates = []
+    for i, (xt, vt, qt) in enumerate(errors(known, scene)):
+        for rule in inadmissible(params, float(xt), float(vt), *(float(b) for b in known.distance[i])):
+            yield f"train[{scene.trains[i]}] at {scene.time:g} s: {rule}, start condition (39)"
+        if known.mixed[i, 0] < qt < known.mixed[i, 1]:
+            slope = params.head_l2 + params.head_l3 * barrier(qt, *known.mixed[i], *known.mixed[i])[1]
+            rates.append(params.head_l1_per_s**2 + slope * slope + params.head_l4)
+    if rates and max(rates) * h > STABLE:
+        yield f"run.sub_step_s = {h:g}: too large for this start, {max(rates):.3g} 1/s times the step must not exceed {STABLE:g}"
+    limited = np.isfinite(np.minimum(np.minimum(c.traction, c.traction_power), np.minimum(c.braking, c.braking_power)))
+    r = float(c.actuator_rate[limited].max()) if limited.any() else 0.0
+    if r * h > STABLE:
+        yield (
+            f"run.sub_step_s = {h:g}: too large where a force limit acts, r h = {r:g} * {h:g} = {r * h:g} must not exceed "
+            f"{STABLE:g} (step at most {STABLE / r:g} s)"
+        )
