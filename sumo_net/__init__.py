@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
 from pathlib import Path
 
 from sumo_net.build import build
@@ -18,5 +17,7 @@ __all__ = [
 
 def shipped() -> dict[str, Path]:
     """The line descriptions that come with the package: name to file."""
+    from importlib.resources import files  # only here: a tenth of the package's import time
+
     folder = Path(str(files("sumo_net"))) / "lines"
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}

@@ -8,7 +8,6 @@ import shutil
 import subprocess
 import tempfile
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -27,32 +26,35 @@ def build(spec: LineSpec, folder: str | Path) -> Path:
     Raises
     ------
     LineError
-        If netconvert is missing or refuses the line.
+        If the folder cannot be written, netconvert is missing, or it refuses the line.
     """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     pieces, slopes = edges(spec), gradient(spec)
-    with tempfile.TemporaryDirectory(prefix=f".{spec.name}.", dir=folder) as scratch:
-        made = Path(scratch)
-        (made / f"{spec.name}.nod.xml").write_text(_nodes(spec, pieces, slopes), encoding="utf-8")
-        (made / f"{spec.name}.edg.xml").write_text(_edges(spec, pieces, slopes), encoding="utf-8")
-        (made / f"{spec.name}.con.xml").write_text(_connections(pieces), encoding="utf-8")
-        _convert(spec.name, made)
-        for file in made.iterdir():
-            file.replace(folder / file.name)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{spec.name}.", dir=folder) as scratch:
+            made = Path(scratch)
+            (made / f"{spec.name}.nod.xml").write_text(_nodes(spec, pieces, slopes), encoding="utf-8")
+            (made / f"{spec.name}.edg.xml").write_text(_edges(spec, pieces, slopes), encoding="utf-8")
+            (made / f"{spec.name}.con.xml").write_text(_connections(pieces), encoding="utf-8")
+            _convert(spec.name, made)
+            for file in sorted(made.iterdir()):
+                file.replace(folder / file.name)
+    except OSError as error:
+        raise LineError([f"{folder}: the net cannot be built here: {error.strerror}"]) from None
     return folder / f"{spec.name}.net.xml"
 
 
 def netconvert() -> tuple[Path, dict[str, str]]:
     """SUMO's net builder and the environment it needs: the one of the eclipse-sumo wheel, else that of the PATH."""
     try:
-        import sumo  # type: ignore[import-untyped]
+        from sumo import SUMO_HOME
     except ImportError:
         found = shutil.which("netconvert")
         if found is None:
             raise LineError(["netconvert: not found; install eclipse-sumo, or put SUMO's bin folder on the PATH"]) from None
         return Path(found), dict(os.environ)
-    return Path(sumo.SUMO_HOME) / "bin" / "netconvert", os.environ | {"SUMO_HOME": sumo.SUMO_HOME}
+    return Path(SUMO_HOME) / "bin" / "netconvert", os.environ | {"SUMO_HOME": SUMO_HOME}
 
 
 def _convert(name: str, folder: Path) -> None:
@@ -142,7 +144,7 @@ def _edges(spec: LineSpec, pieces: list[Edge], slopes: Gradient) -> str:
             f' speed="{_number(e.speed_mps)}" length="{text(e.length_m)}" distance="{text(e.start_m)}"'
             f' allow="{_RAIL}" spreadType="center" shape="{shape}">'
         )
-        lines += [f'        <param key="{key}" value={quoteattr(value)}/>' for key, value in _params(e, slopes).items()]
+        lines += [f'        <param key="{key}" value="{value}"/>' for key, value in _params(e, slopes).items()]
         lines.append("    </edge>")
     return "\n".join([*lines, "</edges>", ""])
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import math
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -167,8 +167,10 @@ class LineSpec(_Strict):
         common |= {self.begin_m: "the beginning of the line", self.end_m: "the end of the line"}
         found = {track: dict(common) for track in self.tracks}
         for c in self.all_crossovers():
-            found[c.from_track].setdefault(c.start_m, f"the switch of {c.name} at {text(c.start_m)} m")
-            found[c.to_track].setdefault(c.end_m, f"the end of {c.name} at {text(c.end_m)} m")
+            if c.from_track in found:
+                found[c.from_track].setdefault(c.start_m, f"the switch of {c.name} at {text(c.start_m)} m")
+            if c.to_track in found:
+                found[c.to_track].setdefault(c.end_m, f"the end of {c.name} at {text(c.end_m)} m")
         return found
 
 
@@ -196,12 +198,12 @@ def parse_spec(data: dict[str, Any], file: str) -> LineSpec:
     """The line described by the tables of a TOML file; ``file`` is its name for messages."""
     found: list[str] = []
     spec: LineSpec | None
-    numbers = list(range(1, len(data["crossover"]) + 1)) if isinstance(data.get("crossover"), list) else []
+    numbers: Numbers = {}
     try:
         spec = LineSpec.model_validate(data)
     except ValidationError as error:
         found = _words(error)
-        spec, numbers = _healthy_part(error, data, numbers)
+        spec, numbers = _healthy_part(error, data)
     if spec is not None:
         found += violations(spec, numbers)
     if found or spec is None:
@@ -238,54 +240,69 @@ def _words(error: ValidationError) -> list[str]:
     return lines
 
 
-def _healthy_part(error: ValidationError, data: dict[str, Any], numbers: list[int]) -> tuple[LineSpec | None, list[int]]:
+#: For every list of a line, the numbers its items have in the file; absent where they are 1, 2, 3, ...
+Numbers = Mapping[str, Sequence[int]]
+
+
+def _healthy_part(error: ValidationError, data: dict[str, Any]) -> tuple[LineSpec | None, Numbers]:
     """The line without what is wrong in itself, so that mistakes between keys are found too; None if too little is left."""
-    rest = {key: list(value) if isinstance(value, list) else value for key, value in data.items()}
-    bad: set[int] = set()
+    rest = dict(data)
+    bad: dict[str, set[int]] = {}
     for e in error.errors(include_url=False):
-        key = e["loc"][0]
-        if key == "crossover" and len(e["loc"]) > 1 and isinstance(e["loc"][1], int):
-            bad.add(e["loc"][1])
+        key, *inside = e["loc"]
+        if key in ("speed", "gradient", "crossover") and inside and isinstance(inside[0], int):
+            bad.setdefault(str(key), set()).add(inside[0])
         else:
             rest.pop(str(key), None)
-    if "crossover" in rest:
-        rest["crossover"] = [c for k, c in enumerate(rest["crossover"]) if k not in bad]
-        numbers = [n for k, n in enumerate(numbers) if k not in bad]
+    numbers = {}
+    for key in bad.keys() & rest.keys():
+        good = [k for k in range(len(data[key])) if k not in bad[key]]
+        rest[key] = [data[key][k] for k in good]
+        numbers[key] = [k + 1 for k in good]
+    if not rest.get("speed"):
+        rest["speed"] = [[rest.get("start_m", 0.0), 1.0]]
     try:
-        return LineSpec.model_validate({"name": "line", "speed": [[rest.get("start_m", 0.0), 1.0]]} | rest), numbers
+        return LineSpec.model_validate({"name": "line"} | rest), numbers
     except ValidationError:
-        return None, []
+        return None, {}
 
 
-def violations(spec: LineSpec, numbers: Sequence[int] = ()) -> list[str]:
-    """Every mistake that lies between the keys of a line, as ``key = value: rule``; ``numbers`` names unnamed crossovers."""
+def violations(spec: LineSpec, numbers: Numbers | None = None) -> list[str]:
+    """Every mistake that lies between the keys of a line, as ``key = value: rule``."""
+    numbers = numbers or {}
     found = [f"tracks = {t}: stands more than once" for t in dict.fromkeys(spec.tracks) if spec.tracks.count(t) > 1]
-    found += _profile_violations(spec)
-    found += _regular_violations(spec)
-    own = [_crossover_violations(spec, label, c) for label, c in _labelled(spec, numbers)]
-    found += [line for lines in own for line in lines]
-    if found or (many := _too_many(spec)):
-        return found or many
-    found += _meeting_violations(spec, numbers)
-    return found or _close_cuts(spec)
+    found += _profile_violations(spec, numbers)
+    found += (regular := _regular_violations(spec))
+    for label, c in _labelled(spec, numbers):
+        found += _crossover_violations(spec, label, c)
+    if many := _too_many(spec):
+        return found + many
+    # What the regular crossovers would meet is worth a word only if they are right in themselves.
+    rest = spec.model_copy(update={"regular_crossovers": None}) if regular else spec
+    return found + _meeting_violations(rest, numbers) + _close_cuts(rest)
 
 
-def _labelled(spec: LineSpec, numbers: Sequence[int]) -> list[tuple[str, Crossover]]:
-    numbers = numbers or range(1, len(spec.crossover) + 1)
-    return [(f"crossover[{n if c.id is None else c.id}]", c) for n, c in zip(numbers, spec.crossover, strict=True)]
+def _labelled(spec: LineSpec, numbers: Numbers) -> list[tuple[str, Crossover]]:
+    counted = zip(numbers.get("crossover", range(1, len(spec.crossover) + 1)), spec.crossover, strict=True)
+    return [(f"crossover[{number if c.id is None else c.id}]", c) for number, c in counted]
 
 
-def _profile_violations(spec: LineSpec) -> list[str]:
+def _profile_violations(spec: LineSpec, numbers: Numbers) -> list[str]:
     found = []
     line = f"the line ({text(spec.begin_m)} to {text(spec.end_m)} m)"
-    if rounded(spec.speed[0][0]) != spec.begin_m:
-        found.append(f"speed[1] = {list(spec.speed[0])}: must begin where the line does, at start_m = {text(spec.begin_m)}")
     for key, profile in (("speed", spec.speed), ("gradient", spec.gradient)):
-        for k, (at, value) in enumerate(profile, 1):
-            if not spec.begin_m <= rounded(at) < spec.end_m and not (key == "speed" and k == 1):
-                found.append(f"{key}[{k}] = {[at, value]}: lies outside {line}")
-            if k > 1 and at <= profile[k - 2][0]:
-                found.append(f"{key}[{k}] = {[at, value]}: from_m must increase, the one before is at {text(profile[k - 2][0])}")
+        counted = zip(numbers.get(key, range(1, len(profile) + 1)), profile, strict=True)
+        before = -math.inf
+        for number, (at, value) in counted:
+            label = f"{key}[{number}] = [{text(at)}, {value:g}]"
+            if key == "speed" and number == 1:
+                if rounded(at) != spec.begin_m:
+                    found.append(f"{label}: must begin where the line does, at start_m = {text(spec.begin_m)}")
+            elif not spec.begin_m <= rounded(at) < spec.end_m:
+                found.append(f"{label}: lies outside {line}")
+            if at <= before:
+                found.append(f"{label}: from_m must increase, the one before begins at {text(before)} m")
+            before = at
     return found
 
 
@@ -341,18 +358,16 @@ def _too_many(spec: LineSpec) -> list[str]:
     return found
 
 
-def _meeting_violations(spec: LineSpec, numbers: Sequence[int]) -> list[str]:
+def _meeting_violations(spec: LineSpec, numbers: Numbers) -> list[str]:
     """Two crossovers with one name, or that lie on top of each other."""
     found = []
     listed = _labelled(spec, numbers)
     everything = listed + [(f"regular_crossovers ({c.name})", c) for c in spec._regular()]
-    first: dict[str, str] = {}
+    first: dict[str, tuple[str, Crossover]] = {}
     for label, c in everything:
-        # An unnamed crossover carries the name of its edge, which another one with the same edge repeats: reported below.
-        for name in dict.fromkeys((c.name, c.edge)):
-            if name in first and c.id is not None and name == c.id:
-                found.append(f"{label}.id = {c.id}: is already the name of {first[name]}")
-            first.setdefault(name, label)
+        other, same = first.setdefault(c.name, (label, c))
+        if same is not c and (c.id is not None or same.id is not None):
+            found.append(f"{label}: its id {c.name} is already that of {other}")
     ways: dict[tuple[str, str], list[tuple[float, float, str]]] = {}
     for label, c in everything:
         ways.setdefault((c.from_track, c.to_track), []).append((c.start_m, c.end_m, label))
