@@ -1,0 +1,281 @@
+"""Robust constrained cooperative control under disturbances: Hu, Fan, Wei, Mathematics 2024, 12(13), 2003, eq. (6).
+
+Sampled, train level, directed weighted graphs. The clamps and the disturbances of eq. (4) are the plant's (``plants.point``); what the
+paper proves and what can be said instead is in ``robust_theory``.
+
+Symbols
+-------
+p, v     position [m], speed [m/s]
+v0       reference speed [m/s], known to all trains
+h        feedback gain of the speed [1/s]
+a_ij     weight with which train i hears train j [1/s2]
+d_ij     wanted p_i - p_j [m]; a link carries the wanted p_sender - p_receiver, which is -d_ij
+T        control period [s]
+u_c      demanded acceleration [m/s2]; the input is u_c plus the running resistance u_r, which the plant adds
+theta_1  greatest speed [m/s]; theta_2 least and greatest input [m/s2]
+kappa    how often the running resistance goes into the input, at least
+
+Notes
+-----
+Departs from the paper:
+
+* Every message is the position minus the reference's, so one that is one period old does not lag behind by v0 T per neighbour. Where all
+  messages are fresh this is eq. (6).
+* A lost message (the paper knows none): the last one is kept. In this frame that takes the silent neighbour to run on at v0, which it does
+  but for its own error, and the loop becomes one with a delay. Leaving the term out instead would leave a train that hears nobody without
+  any position to hold, and constant disturbances would carry it away without bound. A train that has never heard one of its neighbours does
+  not accelerate.
+* There is no spacing constraint: see ``warnings``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+from scipy.sparse import csgraph
+
+from trainctl.controllers import robust_theory as theory
+from trainctl.signals import POSITION, SPEED, Demand, Floats, Links, Scene, Table, Trains
+
+CLOCK: Literal["sampled"] = "sampled"
+
+#: Assumption 1: the input must exceed this many times the running resistance.
+KAPPA = 10.0
+
+#: Inconsistent desired spacings below this are rounding [m].
+SPACING_ROUNDING = 1e-6
+
+#: So many examples of one mistake are named.
+MOST = 8
+
+
+class Params(Table):
+    """Keys of ``[controller]`` with ``law = "robust_constrained"``; the weights a_ij are those of the links."""
+
+    h_per_s: float | tuple[float, ...] = Field(
+        description="Feedback gain h_i of the speed error [1/s], one number or one per train; eq. (6), Assumption 2: 0 < h T < 1"
+    )
+
+
+class Constants(NamedTuple):
+    """Constants of the law."""
+
+    h: Floats  # (n,) 1/s
+
+
+def gains(params: Params, trains: int) -> Floats:
+    """Feedback gain of every train [1/s], shape (n,)."""
+    return np.broadcast_to(np.asarray(params.h_per_s, float), trains).copy()
+
+
+def constants(params: Params, scene: Scene) -> Constants:
+    """Return the law's constants."""
+    return Constants(h=gains(params, len(scene.trains)))
+
+
+def message(constants: Constants, own: Trains, leader: Floats) -> Floats:
+    """Every train sends its position relative to the reference [m] and a 1 that tells a message from silence, shape (n, 2)."""
+    return np.column_stack((own.position - leader[0], np.ones_like(own.position)))
+
+
+def demand(constants: Constants, own: Trains, leader: Floats, links: Links, heard: Floats) -> Demand:
+    """Acceleration asked for, eq. (6) without the resistance term u_r.
+
+    Parameters
+    ----------
+    constants : Constants
+        h.
+    own : Trains
+        Positions [m] and speeds [m/s], as measured.
+    leader : ndarray, shape (4,)
+        Position [m] and speed v0 [m/s] of the reference, and derivatives.
+    links : Links
+        ``desired`` is p_sender - p_receiver [m], ``weight`` a_ij [1/s2].
+    heard : ndarray, shape (L, 2)
+        The last message of each link, see ``message``; zeros where none has come yet.
+
+    Returns
+    -------
+    Demand
+        u_c [m/s2], shape (n,). The law has no saturation of its own.
+    """
+    n, i = len(own.speed), links.receiver
+    said = heard[:, 1] > 0.0
+    error = np.where(said, heard[:, 0] - (own.position[i] - leader[0]) - links.desired, 0.0)  # p_j - p_i + d_ij
+    u_c = -constants.h * (own.speed - leader[1]) + np.bincount(i, links.weight * error, minlength=n)
+    waits = np.bincount(i[~said], minlength=n) > 0
+    return Demand(acceleration=np.where(waits, np.minimum(u_c, 0.0), u_c), saturated=np.zeros(n, bool))
+
+
+def violations(params: Params, scene: Scene) -> list[str]:
+    """Every requirement of the law that the scene breaks, as ``key = value: rule``.
+
+    Notes
+    -----
+    Assumption 2 beyond 0 < h T < 1 is not required: the paper's own example breaks it and runs all the same. ``report`` says so.
+    """
+    n = len(scene.trains)
+    loop_faults = _gain_violations(params, scene) + _graph_violations(scene)
+    found = loop_faults + _clamp_violations(scene) + _assumption_1(scene)
+    if not loop_faults and 1 < n <= theory.DENSE:
+        radius = theory.radius(theory.loop(gains(params, n), scene))
+        if radius >= 1.0:
+            strongest = theory.laplacian(n, scene.links).diagonal().max()
+            found.append(
+                f"topology.weight = {scene.links.weight.max():g}: with h = {np.max(params.h_per_s):g} and T = {scene.control_period:g} s "
+                f"the loop is unstable without any disturbance (spectral radius {radius:.4f}); the weights one train hears with add up to "
+                f"{strongest:g}, Assumption 2 needs less than h^2/4 = {gains(params, n).min() ** 2 / 4:.3g}"
+            )
+    return found
+
+
+def _gain_violations(params: Params, scene: Scene) -> list[str]:
+    n, period = len(scene.trains), scene.control_period
+    if isinstance(params.h_per_s, tuple) and len(params.h_per_s) != n:
+        return [f"controller.h_per_s = {list(params.h_per_s)}: has {len(params.h_per_s)} values for {n} trains"]
+    found = []
+    given = params.h_per_s if isinstance(params.h_per_s, tuple) else (params.h_per_s,)
+    for k, h in enumerate(given):
+        key = f"controller.h_per_s[{k + 1}]" if isinstance(params.h_per_s, tuple) else "controller.h_per_s"
+        if h <= 0.0:
+            found.append(f"{key} = {h:g}: must be above 0")
+        elif h * period >= 1.0:
+            found.append(f"{key} = {h:g}: h T = {h * period:g} with T = {period:g} s; Assumption 2 needs 0 < h T < 1")
+    return found
+
+
+def _graph_violations(scene: Scene) -> list[str]:
+    links, ids = scene.links, scene.trains
+    found = [
+        f"link[{ids[s]} > {ids[r]}].weight = {w:g}: must be above 0"
+        for s, r, w in zip(links.sender, links.receiver, links.weight, strict=True)
+        if not w > 0.0
+    ]
+    found += _not_connected(scene)
+    slot = theory.potentials(len(ids), links)
+    error = links.desired - (slot[links.sender] - slot[links.receiver])
+    for k in np.flatnonzero(np.abs(error) > SPACING_ROUNDING)[:MOST]:
+        s, r = links.sender[k], links.receiver[k]
+        found.append(
+            f"link[{ids[s]} > {ids[r]}].desired_m = {links.desired[k]:g}: contradicts the other links, along which train {ids[s]} is "
+            f"{slot[s] - slot[r]:g} m from train {ids[r]}; d_ij = d_i - d_j must hold around every cycle"
+        )
+    return found
+
+
+def _not_connected(scene: Scene) -> list[str]:
+    """Who cannot reach whom, one example per strongly connected part."""
+    ids, heard = scene.trains, theory.graph(len(scene.trains), scene.links).tocsr()
+    parts, part = csgraph.connected_components(heard, connection="strong")
+    if parts == 1:
+        return []
+    cut: list[str] = []
+    for k in range(parts):
+        if len(cut) > MOST:
+            break
+        i = int(np.flatnonzero(part == k)[0])
+        missed = np.setdiff1d(np.arange(len(ids)), csgraph.breadth_first_order(heard, i, return_predecessors=False))
+        if len(missed):
+            cut.append(f"what train {ids[i]} sends does not reach {_some([f'train {ids[m]}' for m in missed], ', ')}")
+    return [f"link: the graph must be strongly connected (Theorem 1): {_some(cut)}"]
+
+
+def _clamp_violations(scene: Scene) -> list[str]:
+    found, bounds, ids = [], scene.bounds, scene.trains
+    v0 = np.array([np.min(_speeds(scene)), np.max(_speeds(scene))])
+    for key, row in bounds._asdict().items():
+        unit = "mps2" if key.startswith("input") else "mps"
+        missing = [ids[i] for i in np.flatnonzero(~np.isfinite(row))]
+        if missing:
+            found.append(f"bounds.{key}_{unit}: missing for {_some([f'train {i}' for i in missing], ', ')}; the model (4) clamps every speed and input")
+    speed = scene.own[scene.consists.first[:-1], SPEED]
+    for i, name in enumerate(ids):
+        low, high = bounds.speed_lower[i], bounds.speed_upper[i]
+        if v0[1] >= high:
+            found.append(f"reference.speed_mps = {v0[1]:g}: must be below the maximum speed {high:g} m/s of train {name}")
+        if v0[0] <= low:
+            found.append(f"reference.speed_mps = {v0[0]:g}: must be above the least speed {low:g} m/s of train {name}")
+        if low < 0.0:
+            found.append(f"bounds.speed_lower_mps = {low:g}: train {name} must not run backwards; V = [0, theta_1]")
+        if not low <= speed[i] <= high:
+            found.append(f"train[{name}].speed_mps = {speed[i]:g}: outside the admissible speeds [{low:g}, {high:g}] m/s")
+        if bounds.input_lower[i] >= 0.0:
+            found.append(f"bounds.input_lower_mps2 = {bounds.input_lower[i]:g}: must be below 0 (train {name})")
+        if bounds.input_upper[i] <= 0.0:
+            found.append(f"bounds.input_upper_mps2 = {bounds.input_upper[i]:g}: must be above 0 (train {name})")
+    return found
+
+
+def _assumption_1(scene: Scene) -> list[str]:
+    found, bounds = [], scene.bounds
+    r = theory.greatest_resistance(scene)
+    for i, name in enumerate(scene.trains):
+        for key, value in (("input_upper", bounds.input_upper[i]), ("input_lower", -bounds.input_lower[i])):
+            if np.isfinite(value) and np.isfinite(r[i]) and value > 0.0 and value <= KAPPA * r[i]:
+                sign = -value if key == "input_lower" else value
+                found.append(
+                    f"bounds.{key}_mps2 = {sign:g}: only {value / r[i]:.2f} times the running resistance {r[i]:.4f} m/s2 of train {name} "
+                    f"at {bounds.speed_upper[i]:g} m/s; Assumption 1 needs more than {KAPPA:g} times"
+                )
+    return found
+
+
+def warnings(params: Params, scene: Scene, tracks: Sequence[int] | None = None) -> list[str]:
+    """What the law allows but the user should know, as ``key: warning``.
+
+    Parameters
+    ----------
+    params : Params
+        As of the law.
+    scene : Scene
+        The start, or the state after a change of topology.
+    tracks : sequence of int, optional
+        Track of each train; one track for all if left out.
+    """
+    found = []
+    position = scene.own[scene.consists.first[:-1], POSITION]
+    track = np.zeros(len(position), int) if tracks is None else np.asarray(tracks)
+    hears = set(zip(scene.links.receiver.tolist(), scene.links.sender.tolist(), strict=True))
+    order = np.lexsort((-position, track))
+    deaf = [
+        f"{scene.trains[b]} does not hear {scene.trains[a]}"
+        for a, b in zip(order[:-1], order[1:], strict=True)
+        if track[a] == track[b] and (int(b), int(a)) not in hears
+    ]
+    if deaf:
+        found.append(
+            f"link: the law has no spacing constraint and not every follower hears its predecessor on the track: {_some(deaf)}; "
+            "such graphs can end in a collision from starts that braking would save"
+        )
+    speeds = _speeds(scene)
+    if np.ptp(speeds) > 0.0:
+        found.append(f"reference: its speed changes ({np.min(speeds):g} to {np.max(speeds):g} m/s); the paper's v0 is constant")
+    return found
+
+
+def report(params: Params, scene: Scene, amplitude: Floats, constant: Floats | None = None) -> theory.Report:
+    """Theorem 1, the l1 bound and the steady state for this scene; arguments as of ``robust_theory.report``."""
+    return theory.report(gains(params, len(scene.trains)), scene, amplitude, constant)
+
+
+def worst_signs(params: Params, scene: Scene, plus: int, minus: int, steps: int) -> Floats:
+    """Signs of the worst disturbance for a pair of trains; see ``robust_theory.worst_signs``."""
+    return theory.worst_signs(theory.loop(gains(params, len(scene.trains)), scene), plus, minus, steps)
+
+
+def _speeds(scene: Scene) -> Floats:
+    """Speeds of the reference at the ends of its pieces [m/s]."""
+    breaks, position = scene.reference.breaks, scene.reference.position
+    found = []
+    for k, piece in enumerate(position):
+        length = breaks[k + 1] - breaks[k]
+        rate = np.polynomial.polynomial.polyder(piece)
+        found += [np.polynomial.polynomial.polyval(s, rate) for s in (0.0, length if np.isfinite(length) else 0.0)]
+    return np.array(found)
+
+
+def _some(words: Sequence[str], between: str = "; ") -> str:
+    return between.join(words[:MOST]) + (f"{between}and {len(words) - MOST} more" if len(words) > MOST else "")
