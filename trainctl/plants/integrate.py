@@ -2,19 +2,40 @@
 
 Forces held for 0.1 s make unit-level laws diverge, so everything is integrated jointly in sub-steps of 5 to 10 ms inside
 each simulator step, and only the displacement leaves.
+
+What is compiled here neither allocates nor counts references: counting alone took a third of the time of a stage.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-from numba import njit, types, typeof
+from numba import njit
+from numba.core import cgutils as untyped_cgutils
+from numba.extending import intrinsic, overload
 
-from trainctl.signals import POWERS, SPEED, Consists, Floats, Links, Reference, leader_at
+from trainctl.signals import POWERS, Floats, Ints, Links, Reference, leader_at
+
+types: Any = numba.types
+typeof: Any = numba.typeof
+cgutils: Any = untyped_cgutils
+config: Any = numba.config
+
+#: ``njit`` without numba's run time, its allocation and reference counts.
+bare: Any = partial(njit, cache=True, _nrt=False)
+
+
+class Parts(NamedTuple):
+    """The closed loop's functions, compiled: see ``compiled``."""
+
+    functions: Any  # addresses of the seven functions, or these themselves where nothing is compiled
+    advance: Callable[..., None]
+    exchange: Callable[..., None]
 
 
 class Loop(NamedTuple):
@@ -45,6 +66,7 @@ class Extremes(NamedTuple):
     watched_max: Floats
     limited: Floats  # (n,) s, time during which a unit limit acted
     energy: Floats  # (n, 6) J, see signals.POWERS
+    watched: Floats  # (n, q) the constrained quantities when last seen
 
     @classmethod
     def fresh(cls, trains: int, units: int, watched: int) -> Extremes:
@@ -52,12 +74,12 @@ class Extremes(NamedTuple):
         low, high = np.full(units, np.inf), np.full(units, -np.inf)
         return cls(
             low, high, low.copy(), high.copy(), np.full((trains, watched), np.inf), np.full((trains, watched), -np.inf),
-            np.zeros(trains), np.zeros((trains, len(POWERS))),
+            np.zeros(trains), np.zeros((trains, len(POWERS))), np.full((trains, watched), np.nan),
         )  # fmt: skip
 
 
 class Scratch(NamedTuple):
-    """Work space of one stage."""
+    """Work space of one stage, and of the step around it."""
 
     leader: Floats  # (4,)
     correction: Floats  # (U, c)
@@ -67,6 +89,11 @@ class Scratch(NamedTuple):
     power: Floats  # (n, 6)
     sent: Floats  # (n, w)
     limited: Floats  # (n,)
+    own: Floats  # (U, s) at the beginning of the step
+    own_sum: Floats  # (U, s) weighted sum of the stages' rates
+    estimate: Floats  # (U, q)
+    estimate_sum: Floats  # (U, q)
+    applied_first: Floats  # (U,) at the beginning of ``advance``
 
 
 def scratch(own: Floats, estimate: Floats, trains: int, corrections: int, message: int) -> Scratch:
@@ -74,11 +101,12 @@ def scratch(own: Floats, estimate: Floats, trains: int, corrections: int, messag
     units = len(own)
     return Scratch(
         np.zeros(4), np.zeros((units, corrections)), np.zeros(units), np.zeros_like(own), np.zeros_like(estimate),
-        np.zeros((trains, len(POWERS))), np.zeros((trains, message)), np.zeros(trains),
+        np.zeros((trains, len(POWERS))), np.zeros((trains, message)), np.zeros(trains), np.zeros_like(own), np.zeros_like(own),
+        np.zeros_like(estimate), np.zeros_like(estimate), np.zeros(units),
     )  # fmt: skip
 
 
-@njit(cache=True)
+@bare()
 def stage(parts, loop, first, links, reference, air, t, inside, own, estimate, work):  # type: ignore[no-untyped-def]
     """Evaluate the closed loop at one instant: fills ``work`` with forces and rates."""
     demand, message, _, correction, estimate_rate, limit, rate = parts
@@ -112,9 +140,10 @@ def stage(parts, loop, first, links, reference, air, t, inside, own, estimate, w
         rate(i, loop.plant, t, inside, own[a:b], work.applied[a:b], work.own_rate[a:b], work.power[i])
 
 
-@njit(cache=True)
-def exchange(parts, loop, first, links, reference, air, t, own, estimate, work):  # type: ignore[no-untyped-def]
-    """Fill ``work.sent`` with what every train sends at ``t``, each from what it had heard until then."""
+@bare()
+def exchange_kernel(functions, loop, first, links, reference, air, t, own, estimate, work):  # type: ignore[no-untyped-def]
+    """See ``exchange``."""
+    parts = closed_loop(functions, loop, first, links)
     message = parts[1]
     stage(parts, loop, first, links, reference, air, t, t, own, estimate, work)
     for i in range(len(first) - 1):
@@ -122,26 +151,31 @@ def exchange(parts, loop, first, links, reference, air, t, own, estimate, work):
         message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
 
 
-@njit(cache=True)
-def see(parts, loop, first, length, links, own, work, watched, extremes):  # type: ignore[no-untyped-def]
-    """Widen ``extremes`` by the state and the forces of this instant."""
+@bare()
+def see(parts, loop, first, length, links, own, work, extremes):  # type: ignore[no-untyped-def]
+    """Widen ``extremes`` by the state and the forces of this instant; what is NaN widens nothing."""
     watch = parts[2]
     for i in range(len(first) - 1):
         a, b = first[i], first[i + 1]
         for u in range(a, b):
-            extremes.force_min[u] = min(extremes.force_min[u], work.applied[u])
-            extremes.force_max[u] = max(extremes.force_max[u], work.applied[u])
+            widen(extremes.force_min, extremes.force_max, u, work.applied[u])
             if u + 1 < b:
-                stretch = own[u, 0] - own[u + 1, 0] - length[u]
-                extremes.coupler_min[u] = min(extremes.coupler_min[u], stretch)
-                extremes.coupler_max[u] = max(extremes.coupler_max[u], stretch)
-        watch(i, loop.law, work.leader, first, own, links, watched)
-        for q in range(len(watched)):
-            extremes.watched_min[i, q] = min(extremes.watched_min[i, q], watched[q])
-            extremes.watched_max[i, q] = max(extremes.watched_max[i, q], watched[q])
+                widen(extremes.coupler_min, extremes.coupler_max, u, own[u, 0] - own[u + 1, 0] - length[u])
+        watch(i, loop.law, work.leader, first, own, links, extremes.watched[i])
+        for q in range(extremes.watched.shape[1]):
+            widen(extremes.watched_min[i], extremes.watched_max[i], q, extremes.watched[i, q])
 
 
-@njit(cache=True, inline="always")
+@bare(inline="always")
+def widen(low, high, k, value):  # type: ignore[no-untyped-def]
+    """Let ``low[k]`` and ``high[k]`` enclose ``value``."""
+    if value < low[k]:
+        low[k] = value
+    if value > high[k]:
+        high[k] = value
+
+
+@bare(inline="always")
 def along(out, base, factor, direction):  # type: ignore[no-untyped-def]
     """``out = base + factor * direction`` for tables, without temporaries."""
     for r in range(out.shape[0]):
@@ -149,7 +183,7 @@ def along(out, base, factor, direction):  # type: ignore[no-untyped-def]
             out[r, c] = base[r, c] + factor * direction[r, c]
 
 
-@njit(cache=True, inline="always")
+@bare(inline="always")
 def copy(out, table):  # type: ignore[no-untyped-def]
     """``out = table``."""
     for r in range(out.shape[0]):
@@ -157,17 +191,10 @@ def copy(out, table):  # type: ignore[no-untyped-def]
             out[r, c] = table[r, c]
 
 
-@njit(cache=True)
-def advance(parts, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes):  # type: ignore[no-untyped-def]
-    """Integrate ``own`` and ``estimate`` in place over ``n`` classic Runge-Kutta steps of ``h`` seconds from ``t``.
-
-    Steps are split at ``breaks`` (ascending times where the reference or a fault jumps): across a jump the order of the
-    integrator is lost. Returns the forces applied at ``t``, shape (U,).
-    """
-    own0, estimate0 = own.copy(), estimate.copy()
-    own_sum, estimate_sum = np.zeros_like(own), np.zeros_like(estimate)
-    applied0 = np.zeros_like(work.applied)
-    watched = np.zeros(extremes.watched_min.shape[1])
+@bare()
+def advance_kernel(functions, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes):  # type: ignore[no-untyped-def]
+    """See ``advance``."""
+    parts = closed_loop(functions, loop, first, links)
     for k in range(n):
         begin, end = t + k * h, t + (k + 1) * h
         while begin < end:
@@ -177,66 +204,135 @@ def advance(parts, loop, first, length, links, reference, air, t, h, n, breaks, 
                     stop = b
                     break
             dt = stop - begin
-            copy(own0, own)
-            copy(estimate0, estimate)
+            copy(work.own, own)
+            copy(work.estimate, estimate)
             for s in range(4):
                 ahead = 0.0 if s == 0 else (dt if s == 3 else 0.5 * dt)
                 if s > 0:
-                    along(own, own0, ahead, work.own_rate)
-                    along(estimate, estimate0, ahead, work.estimate_rate)
+                    along(own, work.own, ahead, work.own_rate)
+                    along(estimate, work.estimate, ahead, work.estimate_rate)
                 stage(parts, loop, first, links, reference, air, begin + ahead, begin + 0.5 * dt, own, estimate, work)
                 if s == 0:
-                    see(parts, loop, first, length, links, own, work, watched, extremes)
+                    see(parts, loop, first, length, links, own, work, extremes)
                     for i in range(len(work.limited)):
                         extremes.limited[i] += dt * work.limited[i]
                     if k == 0 and begin == t:
-                        for u in range(len(applied0)):
-                            applied0[u] = work.applied[u]
-                    copy(own_sum, work.own_rate)
-                    copy(estimate_sum, work.estimate_rate)
+                        for u in range(len(work.applied)):
+                            work.applied_first[u] = work.applied[u]
+                    copy(work.own_sum, work.own_rate)
+                    copy(work.estimate_sum, work.estimate_rate)
                 else:
-                    along(own_sum, own_sum, 2.0 if s < 3 else 1.0, work.own_rate)
-                    along(estimate_sum, estimate_sum, 2.0 if s < 3 else 1.0, work.estimate_rate)
+                    along(work.own_sum, work.own_sum, 2.0 if s < 3 else 1.0, work.own_rate)
+                    along(work.estimate_sum, work.estimate_sum, 2.0 if s < 3 else 1.0, work.estimate_rate)
                 along(extremes.energy, extremes.energy, (dt if s in (0, 3) else 2.0 * dt) / 6.0, work.power)
-            along(own, own0, dt / 6.0, own_sum)
-            along(estimate, estimate0, dt / 6.0, estimate_sum)
+            along(own, work.own, dt / 6.0, work.own_sum)
+            along(estimate, work.estimate, dt / 6.0, work.estimate_sum)
             begin = stop
-    return applied0
 
 
-def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...]) -> tuple[Callable[..., None], ...]:
-    """The seven functions of the closed loop, compiled for these arguments of ``stage`` (after ``parts``), ready to hand over.
+def signatures(loop: Any, first: Any, links: Any) -> tuple[Any, ...]:
+    """Types of the seven functions for these types of ``Loop``, ``first`` and ``Links``, in the order of ``Parts.functions``."""
+    whole, real, row, table = types.int64, types.float64, types.float64[::1], types.float64[:, ::1]
+    law, observer, plant = loop
+    return (
+        types.void(whole, law, row, real, real, table, table, table, row, table, row),
+        types.void(whole, law, row, real, table, table, table, row),
+        types.void(whole, law, row, first, table, links, row),
+        types.void(whole, observer, table, table, table),
+        types.void(whole, observer, table, table, table, row, table),
+        types.boolean(whole, plant, table, row),
+        types.void(whole, plant, real, real, table, row, table, row),
+    )
 
-    A jitted function passed as an argument makes numba compile its caller in every process, unless its type is spelled out
-    as a function type: so that is done here, and the caches of ``advance`` and ``exchange`` serve.
+
+@intrinsic
+def from_addresses(typingctx, functions, loop, first, links):  # type: ignore[no-untyped-def]
+    """Make functions to call of the addresses of compiled ones.
+
+    Handed over as Python objects, numba would look each of them up again at every call from Python: 0.3 ms.
+    """
+    members = types.Tuple([types.FunctionType(s) for s in signatures(loop, first, links)])
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        addresses = context.make_array(functions)(context, builder, args[0])
+        pointer = context.get_value_type(types.voidptr)
+        values = []
+        for k, member in enumerate(members):
+            value = cgutils.create_struct_proxy(member)(context, builder)
+            value.c_addr = value.py_addr = cgutils.get_null_value(pointer)
+            address = builder.load(cgutils.gep(builder, addresses.data, k))
+            value.jit_addr = builder.inttoptr(address, pointer)
+            values.append(value._getvalue())
+        return context.make_tuple(builder, members, values)
+
+    return members(functions, loop, first, links), codegen
+
+
+def closed_loop(functions: Any, loop: Any, first: Any, links: Any) -> Any:
+    """Make the seven functions of ``Parts.functions`` ready to be called."""
+    return functions
+
+
+@overload(closed_loop)
+def closed_loop_of_addresses(functions, loop, first, links):  # type: ignore[no-untyped-def]
+    """Say what ``closed_loop`` is in compiled code."""
+    return lambda functions, loop, first, links: from_addresses(functions, loop, first, links)  # type: ignore[call-arg]
+
+
+def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...]) -> Parts:
+    """Make the functions of the closed loop ready for ``arguments``, those of ``advance`` after ``parts``.
+
+    They serve as long as the types of the arguments stay: new values, links and constants of the same shape of data need no
+    new call. Compiled code is cached on disk between processes, each module's own.
     """
     functions = (law.demand, law.message, law.watch, observer.correction, observer.rate, plant.limit, plant.rate)
-    if numba.config.DISABLE_JIT:
-        return functions
-    loop, first, length, links, reference, air, _, _, _, breaks, own, estimate, work, extremes = arguments
-    whole, real, row, table = types.int64, types.float64, types.float64[::1], types.float64[:, ::1]
-    law_c, observer_c, plant_c = (typeof(c) for c in loop)
-    signatures = (
-        types.void(whole, law_c, row, real, real, table, table, table, row, table, row),
-        types.void(whole, law_c, row, real, table, table, table, row),
-        types.void(whole, law_c, row, typeof(first), table, typeof(links), row),
-        types.void(whole, observer_c, table, table, table),
-        types.void(whole, observer_c, table, table, table, row, table),
-        types.boolean(whole, plant_c, table, row),
-        types.void(whole, plant_c, real, real, table, row, table, row),
-    )
-    parts = types.Tuple([types.FunctionType(s) for s in signatures])
-    rest = [typeof(x) for x in (links, reference, air)]
-    state = [typeof(x) for x in (own, estimate, work)]
+    if config.DISABLE_JIT:
+        return Parts(functions, advance_kernel, exchange_kernel)
+    loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes = (typeof(a) for a in arguments)
+    addresses = np.empty(len(functions), dtype=np.int64)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", numba.NumbaExperimentalFeatureWarning)  # function types: tested here, kept
-        for function, signature in zip(functions, signatures, strict=True):
-            function.compile(signature)
-        for dispatcher, signature in (
-            (advance, (parts, typeof(loop), typeof(first), row, *rest, real, real, whole, row, *state, typeof(extremes))),
-            (exchange, (parts, typeof(loop), typeof(first), *rest, real, *state)),
-        ):
-            dispatcher.disable_compile(False)
-            dispatcher.compile(signature)
-            dispatcher.disable_compile()  # otherwise a call would compile once more, for these very functions
-    return functions
+        for k, (function, signature) in enumerate(zip(functions, signatures(loop, first, links), strict=True)):
+            from_cache(function, signature.args)
+            code = function.overloads[signature.args]
+            addresses[k] = code.library.get_pointer_to_function(code.fndesc.llvm_func_name)
+        table = typeof(addresses)
+        advance_ = from_cache(
+            advance_kernel,
+            (table, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes),
+        )
+        exchange_ = from_cache(exchange_kernel, (table, loop, first, links, reference, air, t, own, estimate, work))
+    return Parts(addresses, advance_, exchange_)
+
+
+def from_cache(function: Any, arguments: tuple[Any, ...]) -> Callable[..., None]:
+    """Compile for these types, or load what was compiled before."""
+    try:
+        return function.compile(arguments)  # type: ignore[no-any-return]
+    except (ImportError, AttributeError):  # the cache knows a law that is no longer installed
+        function._cache.flush()
+        return function.compile(arguments)  # type: ignore[no-any-return]
+
+
+def advance(
+    parts: Parts, loop: Loop, first: Ints, length: Floats, links: Links, reference: Reference, air: Air, t: float, h: float, n: int,
+    breaks: Floats, own: Floats, estimate: Floats, work: Scratch, extremes: Extremes,
+) -> Floats:  # fmt: skip
+    """Integrate ``own`` and ``estimate`` in place over ``n`` classic Runge-Kutta steps of ``h`` seconds from ``t``.
+
+    Steps are split at ``breaks`` (ascending times where the reference or a fault jumps): across a jump the order of the
+    integrator is lost. Returns the forces applied at ``t``, shape (U,).
+
+    The arguments must be of the types ``compiled`` was given (a float stays a float): nothing is checked here, since numba's own
+    check of so many arguments takes 0.4 ms.
+    """
+    parts.advance(parts.functions, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes)
+    return work.applied_first.copy()
+
+
+def exchange(
+    parts: Parts, loop: Loop, first: Ints, links: Links, reference: Reference, air: Air, t: float, own: Floats, estimate: Floats,
+    work: Scratch,
+) -> None:  # fmt: skip
+    """Fill ``work.sent`` with what every train sends at ``t``, each from what it had heard until then."""
+    parts.exchange(parts.functions, loop, first, links, reference, air, t, own, estimate, work)

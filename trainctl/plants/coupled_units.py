@@ -1,0 +1,195 @@
+"""Power units joined by couplers: the EMU of Wei, Ge and Wu (2022), with unit limits, gradient and rotating masses.
+
+Unit ``j`` of a train moves under its own force, the couplers before and behind it, running resistance and gradient.
+
+Symbols
+-------
+x_j, v_j    position of the front [m], speed [m/s] of unit j, head first
+u_j         force of the unit [N], forward positive
+m_j         mass [kg]; ``rotating`` times that is what accelerates
+l_j         front of unit j to front of unit j + 1 with the coupler at rest [m]
+e_j         stretch of the coupler behind unit j [m], eq. (1)
+k, d        stiffness [N/m] and damping [N s/m] of a coupler, eq. (2)
+c0, c1, c2  Davis coefficients per mass, eq. (3)
+
+Departures from the paper: limits, gradient, rotating masses and disturbances, which it has not, and standstill: resistance is zero
+there and no unit is driven backwards, as if its brakes held it. A train therefore stops and stays, on any gradient.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from pydantic import Field
+
+from trainctl.signals import GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Table
+
+STATES = 2
+
+#: Columns of ``Constants.units``; the first four limits are those of ``Consists``.
+MASS, INERTIA, C0, C1, C2, LENGTH, STIFFNESS, DAMPING, TRACTION, TRACTION_POWER, BRAKING, BRAKING_POWER, PUSH = range(13)
+
+#: A unit that an integration step carried below standstill comes back to it at this rate [1/s].
+HOLD = 20.0
+
+
+class Params(Table):
+    """Keys of ``[plant]`` for ``coupled_units``. They act only under train-level laws, see ``plants.shared``."""
+
+    in_train_stiffness_per_s2: float = Field(
+        6.0, ge=0.0, description="Active part of the coupler stiffness under a train-level law, per unit mass [1/s2]"
+    )
+    in_train_damping_per_s: float = Field(
+        4.0, ge=0.0, description="Active part of the coupler damping under a train-level law, per unit mass [1/s]"
+    )
+
+
+class Constants(NamedTuple):
+    """What the units are and what acts on them."""
+
+    first: Ints  # (n + 1,) rows of each train
+    units: Floats  # (U, 13) one column per constant named above
+    gradient: Floats  # (G, 2) position where a slope begins [m], rise / run; the first reaches back without end
+
+
+def constants(
+    params: Params, consists: Consists, gradient: Floats | None = None, resistance_factor: Floats | None = None
+) -> Constants:
+    """Pack the constants of all units into one table.
+
+    Parameters
+    ----------
+    params : Params
+        Not needed by the motion itself.
+    consists : Consists
+        Units of all trains.
+    gradient : ndarray, shape (G, 2), optional
+        Position where a slope begins [m], ascending, and its rise / run; flat if left out.
+    resistance_factor : ndarray, shape (U,), optional
+        True running resistance over the nominal one; 1 if left out.
+
+    Returns
+    -------
+    Constants
+        The column ``PUSH`` of ``units`` is a disturbing force per mass [m/s2], 0 here; it may be overwritten between steps.
+    """
+    factor = np.ones(len(consists.mass)) if resistance_factor is None else resistance_factor
+    units = np.column_stack([
+        consists.mass, consists.mass * consists.rotating, consists.davis * factor[:, None], consists.length, consists.stiffness,
+        consists.damping, consists.traction, consists.traction_power, consists.braking, consists.braking_power,
+        np.zeros(len(consists.mass)),
+    ])  # fmt: skip
+    slopes = np.zeros((0, 2)) if gradient is None else np.ascontiguousarray(gradient, dtype=np.float64)
+    return Constants(consists.first, np.ascontiguousarray(units, dtype=np.float64), slopes)
+
+
+@njit(cache=True, inline="always")
+def running_resistance(v: float, c0: float, c1: float, c2: float) -> float:
+    """Specific running resistance [N/kg], Davis form: eq. (3), but zero at standstill."""
+    return c0 + (c1 + c2 * v) * v if v > 0.0 else 0.0
+
+
+@njit(cache=True)
+def slope_at(x: float, gradient: Floats) -> float:
+    """Rise / run at position ``x``."""
+    if len(gradient) == 0:
+        return 0.0
+    low, high = 0, len(gradient)
+    while high - low > 1:
+        middle = (low + high) // 2
+        if gradient[middle, 0] <= x:
+            low = middle
+        else:
+            high = middle
+    return gradient[low, 1]  # type: ignore[no-any-return]
+
+
+@njit(cache=True, inline="always")
+def available(v: float, force: float, power: float) -> float:
+    """Largest force at speed ``v`` [N] of a unit limited by ``force`` [N] and ``power`` [W]."""
+    return power / v if v * force > power else force
+
+
+@njit(cache=True)
+def limit(i: int, constants: Constants, own: Floats, applied: Floats) -> bool:
+    """Clip the forces of train ``i`` to force and power limits of its units, in place; True if one acted."""
+    a = constants.first[i]
+    units = constants.units
+    acted = False
+    for j in range(len(applied)):
+        v, u = own[j, SPEED], applied[j]
+        if u > 0.0:
+            most = available(v, units[a + j, TRACTION], units[a + j, TRACTION_POWER])
+            if u > most:
+                applied[j] = most
+                acted = acted or u > most * (1.0 + 1e-9)  # a force meant to be just the limit is not cut
+        else:
+            most = available(v, units[a + j, BRAKING], units[a + j, BRAKING_POWER])
+            if -u > most:
+                applied[j] = -most
+                acted = acted or -u > most * (1.0 + 1e-9)
+    return acted
+
+
+@njit(cache=True)
+def rate(
+    i: int, constants: Constants, t: float, inside: float, own: Floats, applied: Floats, out: Floats, power: Floats
+) -> None:
+    """Write speed and acceleration of every unit of train ``i`` into ``out``, the train's powers into ``power``: eqs. (1)-(4).
+
+    Parameters
+    ----------
+    i : int
+        The train.
+    constants : Constants
+        Of all trains.
+    t, inside : float
+        Time [s]; nothing here depends on it.
+    own : ndarray, shape (units, 2)
+        Position [m] and speed [m/s].
+    applied : ndarray, shape (units,)
+        Force of each unit [N], within its limits.
+    out : ndarray, shape (units, 2)
+        Speed [m/s] and acceleration [m/s2].
+    power : ndarray, shape (6,)
+        See ``signals.POWERS`` [W].
+
+    Notes
+    -----
+    Departs from the paper: at standstill a unit is held unless what acts on it drives it forward.
+    """
+    a, last = constants.first[i], len(applied) - 1
+    units, gradient = constants.units, constants.gradient
+    traction = braking = resistance = damping = climb = disturbance = 0.0
+    pull = 0.0  # f(e_{j-1}): the coupler before this unit, stretched positive
+    for j in range(last + 1):
+        row = a + j
+        v, u, m = own[j, SPEED], applied[j], units[row, MASS]
+        f = 0.0
+        if j < last:
+            e = own[j, POSITION] - own[j + 1, POSITION] - units[row, LENGTH]
+            de = v - own[j + 1, SPEED]
+            f = units[row, STIFFNESS] * e + units[row, DAMPING] * de
+            damping += units[row, DAMPING] * de * de
+        drag = m * running_resistance(v, units[row, C0], units[row, C1], units[row, C2])
+        weight = 0.0 if len(gradient) == 0 else m * GRAVITY * slope_at(own[j, POSITION], gradient)
+        push = m * units[row, PUSH]
+        acceleration = (u + pull - f - drag - weight + push) / units[row, INERTIA]
+        out[j, POSITION] = v
+        out[j, SPEED] = acceleration if v > 0.0 else max(acceleration, -HOLD * v)
+        if u > 0.0:
+            traction += u * v
+        else:
+            braking -= u * v
+        resistance += drag * v
+        climb += weight * v
+        disturbance += push * v
+        pull = f
+    power[0] = traction
+    power[1] = braking
+    power[2] = resistance
+    power[3] = damping
+    power[4] = climb
+    power[5] = disturbance

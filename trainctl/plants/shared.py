@@ -1,0 +1,185 @@
+"""Unit forces under a train-level law: the acceleration it asks for, held over the control period and shared out to the units.
+
+Every unit carries its own mass's share, so couplers at rest stay at rest and the head moves exactly ``v T + a T**2 / 2``. What a
+coupler carries beyond that is damped by pairs of forces that cancel within the train. The functions have the shape of a continuous
+law, to be integrated with ``plants.coupled_units``.
+
+Symbols
+-------
+a_i         acceleration train i holds [m/s2]
+mu, Mu      lower and upper bound of the input, force per mass [m/s2]
+f, F        least and largest running resistance over the speed band [m/s2]
+rho, Rho    lower and upper speed bound [m/s]
+T           control period [s]
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from trainctl.plants import coupled_units
+from trainctl.plants.coupled_units import (
+    BRAKING,
+    BRAKING_POWER,
+    C0,
+    C1,
+    C2,
+    INERTIA,
+    LENGTH,
+    MASS,
+    TRACTION,
+    TRACTION_POWER,
+    available,
+    running_resistance,
+    slope_at,
+)
+from trainctl.signals import GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Links
+
+CLOCK: Literal["continuous"] = "continuous"
+ORDER: Literal["parallel"] = "parallel"
+MESSAGE = 0
+WATCHED: tuple[str, ...] = ()
+
+
+class Constants(NamedTuple):
+    """What the units believe of themselves, and the acceleration they hold."""
+
+    first: Ints  # (n + 1,)
+    units: Floats  # (U, 13) as in coupled_units
+    gradient: Floats  # (G, 2)
+    acceleration: Floats  # (n,) m/s2, overwritten once per control period
+    stiffness: float  # 1/s2
+    damping: float  # 1/s
+
+
+def constants(params: coupled_units.Params, consists: Consists, gradient: Floats | None = None) -> Constants:
+    """Constants for these trains, all holding acceleration 0; the units believe the nominal running resistance."""
+    first, units, slopes = coupled_units.constants(params, consists, gradient)
+    held = np.zeros(len(first) - 1)
+    return Constants(first, units, slopes, held, params.in_train_stiffness_per_s2, params.in_train_damping_per_s)
+
+
+@njit(cache=True)
+def demand(
+    i: int, constants: Constants, leader: Floats, age: float, slot: float, own: Floats, estimate: Floats, correction: Floats,
+    desired: Floats, heard: Floats, out: Floats,
+) -> None:  # fmt: skip
+    """Write the unit forces [N] of train ``i`` for its held acceleration into ``out``: F_ij = m_ij (a_i + R + g slope) + pairs.
+
+    The pairs, one per coupler, are scaled by one factor per train so that no unit leaves its limits because of them.
+    """
+    start, a_i = constants.first[i], constants.acceleration[i]
+    units, gradient = constants.units, constants.gradient
+    last = len(out) - 1
+    scale = 1.0
+    pull = 0.0
+    for j in range(last + 1):
+        row = start + j
+        v, m = own[j, SPEED], units[row, MASS]
+        f = pair(constants, row, own, j) if j < last else 0.0
+        load = running_resistance(v, units[row, C0], units[row, C1], units[row, C2])
+        if len(gradient) > 0:
+            load += GRAVITY * slope_at(own[j, POSITION], gradient)
+        base, extra = units[row, INERTIA] * a_i + m * load, pull - f
+        out[j] = base
+        if extra > 0.0:
+            room = available(v, units[row, TRACTION], units[row, TRACTION_POWER]) - base
+        else:
+            room = available(v, units[row, BRAKING], units[row, BRAKING_POWER]) + base
+        if abs(extra) > room:
+            scale = min(scale, max(room, 0.0) / abs(extra))
+        pull = f
+    if scale > 0.0:
+        for j in range(last):
+            f = scale * pair(constants, start + j, own, j)
+            out[j] -= f
+            out[j + 1] += f
+
+
+@njit(cache=True, inline="always")
+def pair(constants: Constants, row: int, own: Floats, j: int) -> float:
+    """Force [N] the active part of the coupler behind unit ``j`` pulls its two units together with."""
+    e = own[j, POSITION] - own[j + 1, POSITION] - constants.units[row, LENGTH]
+    de = own[j, SPEED] - own[j + 1, SPEED]
+    lighter = min(constants.units[row, MASS], constants.units[row + 1, MASS])
+    return float(lighter * (constants.stiffness * e + constants.damping * de))
+
+
+@njit(cache=True)
+def message(
+    i: int, constants: Constants, leader: Floats, slot: float, own: Floats, estimate: Floats, estimate_rate: Floats, out: Floats
+) -> None:
+    """Nothing to send: trains talk in the sampled law."""
+
+
+@njit(cache=True)
+def watch(i: int, constants: Constants, leader: Floats, first: Ints, own: Floats, links: Links, out: Floats) -> None:
+    """Nothing to watch here."""
+
+
+def room(consists: Consists, lower: Floats, upper: Floats) -> tuple[Floats, Floats]:
+    """Input that every unit of a train can always give in a speed band, whatever the speed: mu and Mu of Assumption 2.4.
+
+    Parameters
+    ----------
+    consists : Consists
+        Units of all trains.
+    lower, upper : ndarray, shape (n,)
+        Speed band of each train, rho and Rho [m/s].
+
+    Returns
+    -------
+    tuple of ndarray, each of shape (n,)
+        Lower and upper bound of the input, acceleration plus the train's mean running resistance [m/s2].
+
+    Notes
+    -----
+    Each unit carries its own mass's share, so the unit weakest per mass decides, traction at the speed where power leaves
+    least. Where rotating mass or Davis coefficients differ between units, their share of the input does too: it is taken at
+    161 speeds of the band.
+    """
+    low, high = np.empty(len(lower)), np.empty(len(lower))
+    for i, (a, b) in enumerate(zip(consists.first[:-1], consists.first[1:], strict=True)):
+        speeds = np.linspace(lower[i], upper[i], 161)[:, None]
+        m, rotating = consists.mass[a:b], consists.rotating[a:b]
+        r = consists.davis[a:b, 0] + consists.davis[a:b, 1] * speeds + consists.davis[a:b, 2] * speeds**2
+        mean = (r @ m / m.sum())[:, None]
+        with np.errstate(divide="ignore"):
+            traction = np.minimum(consists.traction[a:b], consists.traction_power[a:b] / speeds) / m
+            braking = np.minimum(consists.braking[a:b], consists.braking_power[a:b] / speeds) / m
+        high[i] = ((traction - r) / rotating + mean).min()
+        low[i] = ((-braking - r) / rotating + mean).max()
+    return low, high
+
+
+def smallest_period(consists: Consists, speed: Floats, lower: Floats, upper: Floats) -> Floats:
+    """Control period above which Assumption 2.4 of the fully distributed law holds with the units' own limits.
+
+    Parameters
+    ----------
+    consists : Consists
+        Units of all trains.
+    speed, lower, upper : ndarray, shape (n,)
+        Reference speed v_r and speed bounds rho, Rho of each train [m/s], rho < v_r < Rho.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        T = max((Rho - v_r) / (f - mu), (v_r - rho) / (Mu - F)) [s]; infinite where the units cannot hold the band at all.
+    """
+    mu, Mu = room(consists, lower, upper)
+    f, F = mean_resistance(consists, lower), mean_resistance(consists, upper)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        period = np.maximum((upper - speed) / (f - mu), (speed - lower) / (Mu - F))
+    return np.where((mu < f) & (Mu > F), period, np.inf)
+
+
+def mean_resistance(consists: Consists, speed: Floats) -> Floats:
+    """Compute the running resistance per mass [N/kg] of whole trains at these speeds, shape (n,): eq. (3) weighted by mass."""
+    v = np.repeat(speed, np.diff(consists.first))
+    r = consists.davis[:, 0] + consists.davis[:, 1] * v + consists.davis[:, 2] * v**2
+    total = np.add.reduceat(consists.mass * r, consists.first[:-1])
+    return total / consists.train_mass()
