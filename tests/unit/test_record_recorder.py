@@ -79,8 +79,10 @@ def test_parquet_layout(tmp_path: Path) -> None:
     group = file.metadata.row_group(0)
     kinds = {group.column(k).path_in_schema: group.column(k) for k in range(group.num_columns)}
     assert all(column.compression == "ZSTD" for column in kinds.values())
-    assert "BYTE_STREAM_SPLIT" in kinds["position_m"].encodings and not kinds["position_m"].has_dictionary_page
-    assert kinds["train"].has_dictionary_page and kinds["train"].physical_type == "BYTE_ARRAY"
+    assert "BYTE_STREAM_SPLIT" in kinds["position_m"].encodings
+    assert not kinds["position_m"].has_dictionary_page
+    assert kinds["train"].has_dictionary_page
+    assert kinds["train"].physical_type == "BYTE_ARRAY"
 
 
 class Killed(Recorder):
@@ -132,7 +134,8 @@ def test_a_finished_run_of_ours_is_replaced_only_at_the_end(tmp_path: Path) -> N
     folder = tmp_path / "run"
     finished(folder, "old")
     partial = claim(folder)
-    assert partial == partial_of(folder) and not any(partial.iterdir())
+    assert partial == partial_of(folder)
+    assert not any(partial.iterdir())
     assert (folder / "note").read_text() == "old"
     write_info(partial, about_run("", 1, []))
     finish(folder)
@@ -165,11 +168,16 @@ def test_the_current_directory_is_never_replaced(tmp_path: Path, monkeypatch: py
 def test_a_foreign_partial_and_an_unwritable_place_are_refused(tmp_path: Path) -> None:
     (tmp_path / "run.partial").mkdir()
     (tmp_path / "run.partial" / "mine").write_text("x")
-    with pytest.raises(InputError, match="run.partial: exists"):
+    with pytest.raises(InputError, match=r"run\.partial: exists"):
         claim(tmp_path / "run")
     (tmp_path / "file").write_text("x")
     with pytest.raises(InputError, match="cannot be written"):
         claim(tmp_path / "file" / "run")
+
+
+def read_all(folder: Path) -> tuple[object, ...]:
+    run = Run(folder)
+    return run.trains, run.links, run.events, run.scenario
 
 
 @pytest.mark.parametrize(
@@ -191,6 +199,5 @@ def test_damaged_run_folders_give_one_clear_line(tmp_path: Path, spoil, words: s
     (tmp_path / "scenario.toml").write_text("")
     spoil(tmp_path)
     with pytest.raises(InputError, match=words) as caught:
-        run = Run(tmp_path)
-        assert run.trains is not None and run.events is not None and run.scenario is not None
+        read_all(tmp_path)
     assert "\n" not in str(caught.value)

@@ -1,8 +1,7 @@
 """Reading a run folder, finished or not: tables as DataFrames, loaded when first asked for.
 
-    run = Run("runs/three_tracks")
-    run.trains, run.units, run.links        # DataFrames, columns as in DESIGN section 7
-    run.events, run.info, run.metrics, run.scenario
+``run = Run("runs/three_tracks")`` has ``run.trains``, ``run.units``, ``run.links`` (DataFrames with the columns of the run
+folder), ``run.events``, ``run.info``, ``run.metrics`` and ``run.scenario``.
 """
 
 from __future__ import annotations
@@ -134,9 +133,10 @@ class Run:
                 except (pa.ArrowException, OSError) as error:
                     raise InputError(f"{path}: damaged: {_first_line(error)}") from None
         try:
-            return pa.concat_tables(parts).unify_dictionaries().to_pandas()
+            whole: pd.DataFrame = pa.concat_tables(parts).unify_dictionaries().to_pandas()
         except pa.ArrowException as error:
             raise InputError(f"{self.folder}: segments of {table} do not fit together: {_first_line(error)}") from None
+        return whole
 
 
 def _parquet(path: Path) -> pq.ParquetFile:
