@@ -1,15 +1,19 @@
-"""No observer: the law uses what is measured. ``WIDTH`` 0 estimates per unit, no correction."""
+"""No observer: the law uses what is measured."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import numpy as np
 from numba import njit
 
-from trainctl.signals import Floats
+from trainctl.signals import Floats, Scene, Table
 
-WIDTH = 0
 CORRECTIONS = 0
+
+
+class Params(Table):
+    """No keys."""
 
 
 class Constants(NamedTuple):
@@ -18,13 +22,31 @@ class Constants(NamedTuple):
     unused: float = 0.0
 
 
+def width(params: Params) -> int:
+    """No estimates."""
+    return 0
+
+
+def violations(params: Params, scene: Scene) -> list[str]:
+    """Nothing can be wrong."""
+    return []
+
+
+def constants(params: Params, scene: Scene) -> Constants:
+    """Nothing to prepare."""
+    return Constants()
+
+
+def initial(params: Params, own: Floats) -> Floats:
+    """No estimates, shape (U, 0)."""
+    return np.zeros((len(own), 0))
+
+
 @njit(cache=True)
 def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out: Floats) -> None:
     """Nothing to correct."""
 
 
 @njit(cache=True)
-def rate(
-    i: int, constants: Constants, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats
-) -> None:
+def rate(i: int, constants: Constants, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats) -> None:
     """Nothing to estimate."""

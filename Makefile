@@ -1,0 +1,36 @@
+# A machine with Python >= 3.11, pip and make is enough: everything else goes into .venv.
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.ready
+
+.PHONY: run test lint clean help
+
+help:
+	@echo "make run    the default scenario, headless, into runs/three_tracks"
+	@echo "make test   the test suite"
+	@echo "make lint   ruff, mypy and the import rules"
+	@echo "make clean  remove .venv and runs"
+
+run: $(READY)
+	$(BIN)/trainctl run
+
+test: $(READY)
+	$(BIN)/python -m pytest
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+# The last line compiles the kernels once, so that the first run does not wait for them.
+$(READY): requirements.lock pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "trainctl needs Python 3.11 or later")'
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps --editable .
+	$(BIN)/trainctl run three_tracks --backend numeric --set run.duration_s=8 --out .venv/first-run --quiet
+	@touch $(READY)
+
+clean:
+	rm -rf .venv runs

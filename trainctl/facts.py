@@ -1,0 +1,39 @@
+"""What `trainctl check` says of a scenario that has no mistakes: the numbers that follow from it, and its law's own report."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from trainctl.plants import shared
+from trainctl.prepare import Prepared
+from trainctl.topology import graph
+
+
+def facts(p: Prepared) -> dict[str, Any]:
+    """Facts by name, ``warnings`` and the law's ``report`` (both lists of lines)."""
+    run, scene = p.scenario.run, p.first_scene
+    links = graph.edges(scene.links, p.scenario.ids)
+    found: dict[str, Any] = {
+        "title": p.scenario.title,
+        "trains": ", ".join(p.scenario.ids),
+        "law": f"{p.scenario.controller.law} ({p.law.CLOCK})",
+        "plant": p.scenario.plant.kind,
+        "line": f"{p.line.begin_m / 1000:g} .. {p.line.end_m / 1000:g} km, tracks {', '.join(p.line.track_ids)}",
+        "links_at_start": " ".join(f"{a}-{b}" for a, b in links),
+        "steps": run.steps,
+        "step_s": run.step_s,
+    }
+    if p.sampled:
+        found |= {"control_period_s": scene.control_period, "lead_theta": p.theta}
+        if p.scenario.plant.kind != "point" and np.all(np.isfinite(p.bounds.speed_lower) & np.isfinite(p.bounds.speed_upper)):
+            speed = np.full(len(p.scenario.ids), p.leader(0.0)[1])
+            least = shared.smallest_period(p.consists, speed, p.bounds.speed_lower, p.bounds.speed_upper)
+            found["smallest_control_period_s"] = round(float(np.max(least)), 6)
+            found["input_room_mps2"] = [round(float(p.bounds.input_lower.max()), 6), round(float(p.bounds.input_upper.min()), 6)]
+    else:
+        found["sub_step_s"] = scene.sub_step
+    found["warnings"] = list(p.law.warnings(p.params, scene)) if hasattr(p.law, "warnings") else []
+    found["report"] = list(p.law.report(p.params, scene, p.scenario.disturbance)) if hasattr(p.law, "report") else []
+    return found

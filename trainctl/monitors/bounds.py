@@ -1,0 +1,62 @@
+"""Bounds watched while a run goes on: the first time each is broken becomes an event; the metrics count them afterwards."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from trainctl.signals import Floats
+
+if TYPE_CHECKING:
+    from trainctl.prepare import Prepared
+    from trainctl.record.journal import Row
+
+#: Rounding of positions on a line of some hundred kilometres, as SUMO hands them back.
+ROUNDING = 1e-6
+
+
+@dataclass
+class Alarms:
+    """Which bounds have been broken so far, and how often (steps)."""
+
+    count: dict[tuple[str, str], int] = field(default_factory=dict)
+
+    @property
+    def total(self) -> int:
+        """Number of bounds broken at least once."""
+        return len(self.count)
+
+    def new(self, p: Prepared, row: Row) -> Iterator[dict[str, Any]]:
+        """Bounds broken in this row for the first time, as fields of an event."""
+        ids, links = p.scenario.ids, row.links
+        speed, bounds = row.speed, p.bounds
+        yield from self._per_train("speed_lower_mps", speed, bounds.speed_lower, speed < bounds.speed_lower - ROUNDING, ids)
+        yield from self._per_train("speed_upper_mps", speed, bounds.speed_upper, speed > bounds.speed_upper + ROUNDING, ids)
+        if row.motion is not None:
+            u = row.motion.input
+            yield from self._per_train("input_lower_mps2", u, bounds.input_lower, u < bounds.input_lower - ROUNDING, ids)
+            yield from self._per_train("input_upper_mps2", u, bounds.input_upper, u > bounds.input_upper + ROUNDING, ids)
+        spacing = row.seen.position[links.sender] - row.seen.position[links.receiver]
+        ahead = spacing > 0.0  # each pair once
+        names = [f"{ids[s]}-{ids[r]}" for s, r in zip(links.sender, links.receiver, strict=True)] if len(spacing) < 64 else None
+        for key, bound, broken in (
+            ("spacing_lower_m", links.lower, spacing < links.lower - ROUNDING),
+            ("spacing_upper_m", links.upper, spacing > links.upper + ROUNDING),
+        ):
+            hit = np.flatnonzero(broken & ahead)
+            for k in hit.tolist():
+                who = names[k] if names else f"{ids[links.sender[k]]}-{ids[links.receiver[k]]}"
+                yield from self._once(key, who, float(spacing[k]), float(bound[k]))
+
+    def _per_train(self, key: str, value: Floats, bound: Floats, broken: Any, ids: Any) -> Iterator[dict[str, Any]]:
+        for i in np.flatnonzero(broken).tolist():
+            yield from self._once(key, ids[i], float(value[i]), float(bound[i]))
+
+    def _once(self, key: str, who: str, value: float, bound: float) -> Iterator[dict[str, Any]]:
+        seen = self.count.get((key, who), 0)
+        self.count[key, who] = seen + 1
+        if not seen:
+            yield {"bound": key, "who": who, "value": value, "limit": bound}

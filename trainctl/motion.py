@@ -1,0 +1,181 @@
+"""The plant as the loop drives it: the exact map of point trains, or units integrated jointly with observer and law."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from trainctl.plants import actuated_units, coupled_units, faults, integrate, point, shared
+from trainctl.plants.disturbance import Disturbed
+from trainctl.prepare import Prepared
+from trainctl.signals import GRAVITY, POSITION, SPEED, Bools, Demand, Floats, Links, Scene
+from trainctl.topology.exchange import Exchange
+
+
+class Motion(NamedTuple):
+    """One simulator step of all trains."""
+
+    displacement: Floats  # (n,) m, what SUMO is told to do
+    input: Floats  # (n,) m/s2, force of the whole train per mass at the beginning of the step
+    limited: Bools  # (n,) a limit of the plant acted
+    clipped: Bools  # (n,) the train would have moved backwards
+    force: Floats | None  # (U,) N at the beginning of the step
+
+
+class Points:
+    """Point trains under a sampled law."""
+
+    def __init__(self, p: Prepared) -> None:
+        self.step = p.scenario.run.step_s
+        self.constants = point.constants(p.plant_params, p.consists)
+
+    def believed_resistance(self, own: Floats) -> Floats:
+        """Running resistance at the present speed [N/kg], shape (n,)."""
+        return point.resistance(own[:, 1], self.constants.davis)
+
+    def advance(
+        self, k: int, t: float, own: Floats, demand: Demand, links: Links | None, exchange: Exchange, disturbed: Disturbed
+    ) -> tuple[Floats, Motion]:
+        """One exact step of the discrete map."""
+        constants = self.constants._replace(resistance_factor=disturbed.resistance)
+        kick = point.Kick(disturbed.position, disturbed.speed, disturbed.input)
+        moved = point.advance(constants, own, demand.acceleration, self.step, kick)
+        return moved.own, Motion(moved.displacement, moved.input, moved.limited, moved.clipped, None)
+
+
+class Units:
+    """Trains of units, integrated jointly with observer and law in sub-steps; a sampled law's acceleration is shared out to them.
+
+    Holds what belongs to the integration: estimates, held messages, extremes since the last row.
+    """
+
+    def __init__(self, p: Prepared) -> None:
+        self.p = p
+        run = p.scenario.run
+        self.step, self.sub_steps = run.step_s, run.sub_steps
+        self.h = self.step / self.sub_steps
+        self.law: Any = shared if p.sampled else p.law
+        self.period = p.scenario.topology.communication_period_s
+        self.estimate: Floats = p.observer.initial(p.observer_params, p.own)
+        self.gradient = np.column_stack([p.line.gradient.breaks, p.line.gradient.slope])
+        if not self.gradient[:, 1].any():
+            self.gradient = np.zeros((0, 2))
+        self.plant: Any = (
+            coupled_units.constants(p.plant_params, p.consists, self.gradient)
+            if p.scenario.plant.kind == "coupled_units"
+            else actuated_units.constants(p.plant_params, p.first_scene, p.scenario.fault)
+        )
+        noisy = p.scenario.plant.kind == "actuated_units" and p.plant_params.noise_variance_m2_per_s6 > 0.0
+        self.noise_hold = p.plant_params.noise_hold_s if noisy else None
+        self.breaks = np.unique(np.concatenate([p.reference.breaks[np.isfinite(p.reference.breaks)], faults.breaks(p.scenario.fault)]))
+        self.masses = p.consists.train_mass()
+        self.extremes = self._fresh()
+        self.counted = -1  # number of the last exchange
+
+    def believed_resistance(self, own: Floats) -> Floats:
+        """Running resistance and gradient of whole trains per mass [N/kg], shape (n,)."""
+        c, v = self.p.consists, own[:, SPEED]
+        per_unit = c.davis[:, 0] + c.davis[:, 1] * v + c.davis[:, 2] * v**2
+        if len(self.gradient):
+            where = np.maximum(np.searchsorted(self.gradient[:, 0], own[:, POSITION], side="right") - 1, 0)
+            per_unit = per_unit + GRAVITY * self.gradient[where, 1]
+        total: Floats = np.add.reduceat(c.mass * per_unit, c.first[:-1]) / self.masses
+        return total
+
+    def taken(self) -> integrate.Extremes:
+        """Extremes since they were last taken."""
+        past, self.extremes = self.extremes, self._fresh()
+        return past
+
+    def _fresh(self) -> integrate.Extremes:
+        return integrate.Extremes.fresh(len(self.masses), len(self.estimate), len(self.law.WATCHED))
+
+    def relink(self, scene: Scene, constants: Any) -> None:
+        """Take over a new edge list; ``constants`` are the law's own (a sampled law does not run here)."""
+        p = self.p
+        own_law = shared.constants(p.plant_params, p.consists, self.gradient) if p.sampled else constants
+        self.loop = integrate.Loop(own_law, p.observer.constants(p.observer_params, scene), self.plant)
+        messages = len(scene.links.sender), self.law.MESSAGE
+        self.air = integrate.Air(np.zeros(messages), self.period is None, self.law.ORDER == "chain", 0.0)
+        self.work = integrate.scratch(p.own, self.estimate, len(self.masses), p.observer.CORRECTIONS, self.law.MESSAGE)
+        self.counted = -1
+        self.parts = integrate.compiled(
+            self.law, p.observer, p.plant,
+            (self.loop, p.consists.first, p.consists.length, scene.links, p.reference, self.air, 0.0, self.h, 1, self.breaks,
+             p.own, self.estimate, self.work, self.extremes),
+        )  # fmt: skip
+
+    def advance(
+        self, k: int, t: float, own: Floats, demand: Demand, links: Links | None, exchange: Exchange, disturbed: Disturbed
+    ) -> tuple[Floats, Motion]:
+        """Integrate over one simulator step; the displacement is that of the heads."""
+        assert links is not None
+        p, first, heads = self.p, self.p.consists.first, self.p.heads
+        if p.sampled:
+            self.loop.law.acceleration[:] = demand.acceleration
+        self._disturb(disturbed)
+        moved = own.copy()
+        moved[:, SPEED] += np.repeat(disturbed.speed, np.diff(first))
+        limited = self.extremes.limited.copy()
+        force = None
+        for begin, sub_steps in self._pieces(t):
+            self._exchange(begin, moved, links, exchange)
+            self._make_noise(begin)
+            applied = integrate.advance(
+                self.parts, self.loop, first, p.consists.length, links, p.reference, self.air, begin, self.h, sub_steps, self.breaks,
+                moved, self.estimate, self.work, self.extremes,
+            )  # fmt: skip
+            force = applied if force is None else force
+        assert force is not None
+        displacement = moved[heads, POSITION] - own[heads, POSITION] + disturbed.position
+        clipped = displacement < 0.0
+        displacement[clipped] = 0.0
+        shift = np.repeat(own[heads, POSITION] + displacement - moved[heads, POSITION], np.diff(first))
+        moved[:, POSITION] += shift
+        return moved, Motion(
+            displacement=displacement, input=np.add.reduceat(force, heads) / self.masses,
+            limited=self.extremes.limited > limited, clipped=clipped, force=force,
+        )  # fmt: skip
+
+    def _pieces(self, t: float) -> list[tuple[float, int]]:
+        """(start, sub-steps) of the stretches of one simulator step within which messages and noise are held."""
+        cuts = {0}
+        for period in (self.period, self.noise_hold):
+            if period is not None and period < self.step:
+                cuts |= set(range(0, self.sub_steps, round(period / self.h)))
+        starts = sorted(cuts)
+        return [(t + a * self.h, b - a) for a, b in pairwise([*starts, self.sub_steps])]
+
+    def _exchange(self, t: float, own: Floats, links: Links, exchange: Exchange) -> None:
+        """Send and hear, if an exchange is due at ``t``. A link opens with a message that arrives."""
+        if self.period is None:
+            return
+        number = math.floor(t / self.period + 1e-6)
+        if number == self.counted:
+            return
+        self.counted = number
+        first = self.p.consists.first
+        integrate.exchange(self.parts, self.loop, first, links, self.p.reference, self.air, t, own, self.estimate, self.work)
+        exchange.deliver(self.work.sent.copy(), own[self.p.heads, POSITION], links, number)
+        fresh = ~exchange.ever
+        exchange.heard[fresh] = self.work.sent[links.sender[fresh]]
+        self.air = self.air._replace(heard=exchange.heard.copy(), sent_at=t)
+
+    def _make_noise(self, t: float) -> None:
+        """Overwrite the plant's noise if a new sample begins at ``t``."""
+        if self.noise_hold is None:
+            return
+        sample = math.floor(t / self.noise_hold + 1e-6)
+        self.plant.noise[:] = actuated_units.noise(self.p.plant_params, self.p.scenario.run.seed or 0, sample, len(self.estimate))
+
+    def _disturb(self, disturbed: Disturbed) -> None:
+        """Hand this step's disturbing forces and resistance errors to the plant."""
+        if self.p.scenario.plant.kind != "coupled_units":
+            return
+        units = np.diff(self.p.consists.first)
+        table = self.plant.units
+        table[:, coupled_units.PUSH] = np.repeat(disturbed.input, units)
+        table[:, coupled_units.C0 : coupled_units.C2 + 1] = self.p.consists.davis * np.repeat(disturbed.resistance, units)[:, None]

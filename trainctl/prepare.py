@@ -1,0 +1,410 @@
+"""From a scenario to the arrays of the loop, and everything that is wrong with it, before anything runs."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import math
+import pkgutil
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+import sumo_net
+from sumo_net import Line, LineError
+from trainctl import controllers, observers
+from trainctl.errors import InputError
+from trainctl.plants import actuated_units, disturbance, point, shared
+from trainctl.scenario import Event, Scenario, mistakes
+from trainctl.signals import FORCE, POSITION, SPEED, Bounds, Consists, Floats, Ints, Links, Reference, Scene, leader_at
+from trainctl.topology import graph
+
+ENTRY_POINTS = "trainctl.controllers"
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A scenario as arrays, and the modules it names. ``spec`` is the line's description, or None if it came as a net."""
+
+    scenario: Scenario
+    file: str
+    line: Line
+    spec: Any
+    net: Path | None
+    law: Any
+    params: Any
+    plant: Any
+    plant_params: Any
+    observer: Any
+    observer_params: Any
+    consists: Consists
+    own: Floats
+    bounds: Bounds
+    reference: Reference
+    plan: graph.Plan
+
+    @property
+    def heads(self) -> Ints:
+        """Rows of the head units in per-unit arrays, shape (n,)."""
+        return self.consists.first[:-1]
+
+    @property
+    def sampled(self) -> bool:
+        """Whether the law is evaluated once per control period."""
+        return bool(self.law.CLOCK == "sampled")
+
+    @property
+    def theta(self) -> float:
+        """Lead of the plant: x(k+1) = x + ((1 - theta) v(k) + theta v(k+1)) T_c under a held acceleration."""
+        return point.lead(self.scenario.run.held_steps) if self.scenario.plant.kind == "point" else 0.5
+
+    @cached_property
+    def start_track(self) -> Ints:
+        """Track of every train at the start, as index into ``line.track_ids``."""
+        return np.array([self.line.track_ids.index(t.track) for t in self.scenario.train], np.int64)
+
+    def links(self, position: Floats, track: Ints) -> Links:
+        """Who hears whom with the trains there."""
+        return graph.links(self.plan, graph.order_on_tracks(position, track), track)
+
+    def scene(self, own: Floats, links: Links, time: float) -> Scene:
+        """What the law needs to check itself and to prepare its constants."""
+        run = self.scenario.run
+        return Scene(
+            trains=self.scenario.ids, consists=self.consists, own=own, links=links, bounds=self.bounds, reference=self.reference,
+            time=time, step=run.step_s, control_period=run.control_period_s or run.step_s, lead=self.theta,
+            sub_step=run.step_s if self.scenario.plant.kind == "point" else run.step_s / run.sub_steps,
+        )  # fmt: skip
+
+    @cached_property
+    def first_scene(self) -> Scene:
+        """The scene at time 0."""
+        return self.scene(self.own, self.links(self.own[self.heads, POSITION], self.start_track), 0.0)
+
+    def leader(self, t: float) -> Floats:
+        """Position, speed, acceleration and jerk of the reference at ``t``, shape (4,)."""
+        out = np.empty(4)
+        leader_at(self.reference, t, t, out)
+        return out
+
+
+def laws() -> list[str]:
+    """Names of the laws that come with the package and of those other packages offer."""
+    own = [m.name for m in pkgutil.iter_modules(controllers.__path__) if hasattr(_module(controllers, m.name), "CLOCK")]
+    return sorted({*own, *(e.name for e in importlib.metadata.entry_points(group=ENTRY_POINTS))})
+
+
+def _module(package: Any, name: str) -> Any:
+    return importlib.import_module(f"{package.__name__}.{name}")
+
+
+def find_law(name: str) -> Any:
+    """The module of a law: one of ours, or an entry point of another package."""
+    if name.isidentifier() and any(m.name == name for m in pkgutil.iter_modules(controllers.__path__)):
+        module = _module(controllers, name)
+        if hasattr(module, "CLOCK"):
+            return module
+    for entry in importlib.metadata.entry_points(group=ENTRY_POINTS, name=name):
+        return entry.load()
+    raise InputError(f"controller.law = {name}: no such law; known: {', '.join(laws())}")
+
+
+def find_observer(name: str) -> Any:
+    """The module of an observer."""
+    known = [m.name for m in pkgutil.iter_modules(observers.__path__)]
+    if name not in known:
+        raise InputError(f"observer.kind = {name}: no such observer; known: {', '.join(known)}")
+    return _module(observers, name)
+
+
+def prepare(scenario: Scenario, file: str, folder: Path) -> Prepared:
+    """Everything the loop needs, checked.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        As read.
+    file : str
+        Its name, for the mistakes.
+    folder : Path
+        Where relative paths in it start.
+
+    Raises
+    ------
+    InputError
+        All mistakes that could be found, one line each.
+    """
+    found: list[str] = []
+
+    def attempt(function: Any, *arguments: Any) -> Any:
+        try:
+            return function(*arguments)
+        except InputError as error:
+            found.extend(error.mistakes)
+        except LineError as error:
+            found.extend(f"network: {m}" for m in error.mistakes)
+        return None
+
+    law = attempt(find_law, scenario.controller.law)
+    params = attempt(_params, law.Params, scenario.controller.keys(), "controller") if law else None
+    observer = attempt(find_observer, scenario.observer.kind)
+    observer_params = attempt(_params, observer.Params, scenario.observer.keys(), "observer") if observer else None
+    plant = importlib.import_module(f"trainctl.plants.{scenario.plant.kind}")
+    plant_params = attempt(_params, plant.Params, scenario.plant.keys(), "plant")
+    network = attempt(_network, scenario, folder)
+    plan = attempt(_plan, scenario)
+    if network is not None:
+        found += _on_the_line(scenario, network[0])
+    if found or network is None:
+        raise InputError([f"{file}: {line}" for line in found])
+
+    consists = scenario.consists()
+    own = _initial(scenario, consists, getattr(plant, "STATES", 2))
+    first_slot = scenario.topology.first_slot_m
+    prepared = Prepared(
+        scenario=scenario, file=file, line=network[0], spec=network[1], net=network[2], law=law, params=params,
+        plant=plant, plant_params=plant_params, observer=observer, observer_params=observer_params,
+        consists=consists, own=own, bounds=_bounds(scenario, consists),
+        reference=scenario.reference.leader(own[0, POSITION] - first_slot), plan=plan,
+    )  # fmt: skip
+    found = _fits(prepared)
+    if not found:
+        scene = prepared.first_scene
+        found = [*_connected(prepared), *law.violations(params, scene), *observer.violations(observer_params, scene)]
+    if found:
+        raise InputError([f"{file}: {line}" for line in found])
+    return prepared
+
+
+def _params(model: Any, keys: dict[str, Any], table: str) -> Any:
+    import json
+
+    try:
+        return model.model_validate_json(json.dumps(keys))
+    except ValidationError as error:
+        lines = mistakes(error, keys, table)
+        known = ", ".join(model.model_fields) or "none"
+        raise InputError([f"{m}; known: {known}" if m.endswith("unknown key") else m for m in lines]) from None
+
+
+def _network(scenario: Scenario, folder: Path) -> tuple[Line, Any, Path | None]:
+    network = scenario.network
+    if network.net is not None:
+        path = folder / network.net
+        return Line.read(path), None, path
+    name = str(network.line)
+    known = sumo_net.shipped()
+    if name not in known and not name.endswith(".toml"):
+        raise InputError(f"network.line = {name}: no such line; known: {', '.join(known)}, or the path of a line .toml")
+    spec = sumo_net.read_spec(known.get(name, folder / name))
+    return Line.of(spec), spec, None
+
+
+def _plan(scenario: Scenario) -> graph.Plan:
+    """The topology's rule as arrays; what is missing is told."""
+    top, ids = scenario.topology, list(scenario.ids)
+    said: dict[tuple[int, int], graph.Stated] = {}
+    found = []
+    for k, link in enumerate(scenario.link, 1):
+        a, b = (ids.index(i) for i in link.ends)
+        if (a, b) in said:
+            found.append(f"link[{k}]: trains {', '.join(link.ends)} have a link already")
+        said[a, b] = graph.Stated(link.desired_m, link.lower_m, link.upper_m, link.weight)
+        if link.between:
+            low, high = (None if x is None else -x for x in (link.upper_m, link.lower_m))
+            said[b, a] = graph.Stated(None if link.desired_m is None else -link.desired_m, low, high, link.weight)
+    rows = []
+    for k in range(len(ids) - 1):
+        own = said.get((k, k + 1), graph.Stated(None, None, None, None))
+        desired = own.desired if own.desired is not None else top.spacing_m
+        lower = own.lower if own.lower is not None else top.lower_m
+        upper = own.upper if own.upper is not None else top.upper_m
+        if desired is None:
+            found.append(f"topology.spacing_m: missing, and no [[link]] states desired_m between trains {ids[k]} and {ids[k + 1]}")
+        rows.append((desired or 0.0, -math.inf if lower is None else lower, math.inf if upper is None else upper))
+    if top.rule == "links" and not scenario.link and len(ids) > 1:
+        found.append('topology.rule = links: there is no [[link]]; rule = "same_track" makes links by itself')
+    if top.delay_s > 0:
+        period = _exchange_period(scenario)
+        if abs(top.delay_s / period - round(top.delay_s / period)) > 1e-6:
+            found.append(f"topology.delay_s = {top.delay_s:g}: must be a multiple of the exchange period {period:g} s")
+    if found:
+        raise InputError(found)
+    table = np.array(rows, float).reshape(len(rows), 3)
+    pairs = [(tuple(ids.index(i) for i in link.ends), link) for link in scenario.link]
+    both = [(a, b) for (a, b), link in pairs] + [(b, a) for (a, b), link in pairs if link.between]
+    return graph.Plan(
+        rule=top.rule, equal=top.desired == "equal", first_slot=top.first_slot_m,
+        desired=table[:, 0].copy(), lower=table[:, 1].copy(), upper=table[:, 2].copy(), weight=top.weight, stated=said,
+        extra=tuple((a, b) for (a, b), link in pairs if link.extra),
+        fixed=tuple(both) if top.rule == "links" else (),
+    )  # fmt: skip
+
+
+def _exchange_period(scenario: Scenario) -> float:
+    run = scenario.run
+    return scenario.topology.communication_period_s or run.control_period_s or run.step_s
+
+
+def _on_the_line(scenario: Scenario, line: Line) -> list[str]:
+    """Trains beside the line or inside one another, crossovers that do not exist or are behind."""
+    found, placed = [], []
+    for t in scenario.train:
+        here = f"train[{t.id}]"
+        if t.track not in line.track_ids:
+            found.append(f"{here}.track = {t.track}: no such track; there are: {', '.join(line.track_ids)}")
+        elif not line.begin_m <= t.position_m <= line.end_m:
+            found.append(f"{here}.position_m = {t.position_m:.10g}: off the line, which is {line.begin_m:.10g} .. {line.end_m:.10g} m")
+        else:
+            kind = scenario.train_type[t.type]
+            length = math.fsum(kind.per_unit("unit_length_m"))
+            if t.position_m - length < line.begin_m:
+                tail = t.position_m - length
+                found.append(f"{here}.position_m = {t.position_m:.10g}: its tail at {tail:.10g} m is off the line, which begins at {line.begin_m:.10g} m")
+            placed.append((t.track, t.position_m, length, t.id))
+    for (track, x, length, i), (other, y, _, j) in pairwise(sorted(placed, key=lambda p: (p[0], -p[1]))):
+        if track == other and y > x - length or (track == other and y == x):
+            found.append(f"train[{j}].position_m = {y:.10g}: overlaps train {i} on track {track}, whose rear is at {x - length:.10g} m")
+    where = {t.id: (t.track, t.position_m, t) for t in scenario.train}
+    for k, event in sorted(enumerate(scenario.event, 1), key=lambda e: e[1].time_s):
+        track, at_least, t = where[event.train]
+        if track in line.track_ids:
+            where[event.train] = (*_reroute(f"event[{k}]", event, scenario, line, track, at_least, found), t)
+    return found
+
+
+def _reroute(
+    here: str, event: Event, scenario: Scenario, line: Line, track: str, at_least: float, found: list[str]
+) -> tuple[str, float]:
+    """Check one reroute as far as it is certain before the run; where the train is afterwards, at least."""
+    train = next(t for t in scenario.train if t.id == event.train)
+    slowest = train.speed_lower_mps if train.speed_lower_mps is not None else scenario.bounds.speed_lower_mps
+    passed = max(at_least, train.position_m + max(slowest or 0.0, 0.0) * event.time_s)
+    if event.crossover is None:
+        if event.to_track not in line.track_ids:
+            found.append(f"{here}.to_track = {event.to_track}: no such track; there are: {', '.join(line.track_ids)}")
+            return track, at_least
+        ahead = line.next_crossover(track, passed, str(event.to_track))
+        if ahead is None:
+            found.append(f"{here}.to_track = {event.to_track}: no crossover from track {track} to it beyond {passed:.10g} m")
+            return track, at_least
+        return ahead.to_track, ahead.start_m
+    named = {c.id: c for c in line.crossovers}
+    if event.crossover not in named:
+        near = [c.id for c in line.crossovers if c.from_track == track and c.start_m > passed][:3]
+        hint = f"; next on track {track}: {', '.join(near)}" if near else ""
+        found.append(f"{here}.crossover = {event.crossover}: no such crossover{hint}")
+        return track, at_least
+    crossover = named[event.crossover]
+    if crossover.from_track != track:
+        found.append(f"{here}.crossover = {crossover.id}: leaves track {crossover.from_track}, train {event.train} is on track {track}")
+    elif crossover.start_m <= passed:
+        found.append(
+            f"{here}.crossover = {crossover.id}: its switch at {crossover.start_m:.10g} m has been passed, train {event.train}"
+            f" is at {passed:.10g} m or beyond at {event.time_s:g} s"
+        )
+    return crossover.to_track, max(at_least, crossover.start_m)
+
+
+def _initial(scenario: Scenario, consists: Consists, states: int) -> Floats:
+    """State of all units at time 0: couplers at rest and one speed, unless the train says otherwise. Shape (U, states)."""
+    own = np.zeros((len(consists.length), states))
+    for i, t in enumerate(scenario.train):
+        a, b = consists.first[i], consists.first[i + 1]
+        back = np.concatenate([[0.0], np.cumsum(consists.length[a : b - 1] + np.asarray(t.coupler_m or 0.0))])
+        own[a:b, POSITION] = t.position_m - back
+        own[a:b, SPEED] = t.speed_mps if t.unit_speed_mps is None else t.unit_speed_mps
+    return actuated_units.balanced(own, consists) if states > FORCE else own
+
+
+def _bounds(scenario: Scenario, consists: Consists) -> Bounds:
+    """The scenario's bounds; where it states no input bounds, what the units can always give within the speed band."""
+    bounds = scenario.bounds_of_trains()
+    if scenario.plant.kind == "point":
+        return bounds
+    least, greatest = shared.room(consists, bounds.speed_lower, bounds.speed_upper)
+    return bounds._replace(
+        input_lower=np.where(np.isfinite(bounds.input_lower), bounds.input_lower, least),
+        input_upper=np.where(np.isfinite(bounds.input_upper), bounds.input_upper, greatest),
+    )
+
+
+def _fits(p: Prepared) -> list[str]:
+    """Law, plant and observer that do not go together, bounds no train can keep, a line that is too short."""
+    found = []
+    plants = getattr(p.law, "PLANTS", ("point", "coupled_units") if p.sampled else ("coupled_units",))
+    if p.scenario.plant.kind not in plants:
+        found.append(f"plant.kind = {p.scenario.plant.kind}: law {p.scenario.controller.law} runs on {', '.join(plants)}")
+    known = getattr(p.law, "OBSERVERS", ("none",))
+    if p.scenario.observer.kind not in known:
+        found.append(f"observer.kind = {p.scenario.observer.kind}: law {p.scenario.controller.law} works with {', '.join(known)}")
+    end = p.scenario.run.duration_s
+    travel = p.leader(end)[0] - p.leader(0.0)[0]
+    for i, t in enumerate(p.scenario.train):
+        if t.position_m + travel > p.line.end_m:
+            found.append(
+                f"run.duration_s = {end:g}: at the reference speed train {t.id} reaches {t.position_m + travel:.0f} m, beyond the line's"
+                f" end at {p.line.end_m:.10g} m"
+            )
+        for key, low, high in (("speed", p.bounds.speed_lower[i], p.bounds.speed_upper[i]), ("input", p.bounds.input_lower[i], p.bounds.input_upper[i])):
+            if not low < high:
+                found.append(f"train[{t.id}]: {key} bounds {low:g} .. {high:g} are empty")
+    found += [*_messages_fit(p), *_disturbances_fit(p)]
+    if p.scenario.plant.kind != "point" and p.sampled:
+        least, greatest = shared.room(p.consists, p.scenario.bounds_of_trains().speed_lower, p.scenario.bounds_of_trains().speed_upper)
+        for i, t in enumerate(p.scenario.train):
+            if p.bounds.input_lower[i] < least[i] - 1e-12:
+                found.append(f"train[{t.id}].input_lower_mps2 = {p.bounds.input_lower[i]:g}: its units can brake with {-least[i]:.6g} m/s2 at most")
+            if p.bounds.input_upper[i] > greatest[i] + 1e-12:
+                found.append(f"train[{t.id}].input_upper_mps2 = {p.bounds.input_upper[i]:g}: its units can give {greatest[i]:.6g} m/s2 at most at the upper speed bound")
+    return found
+
+
+def _messages_fit(p: Prepared) -> list[str]:
+    """Exchange periods, loss and delay against the law's clock."""
+    run, top = p.scenario.run, p.scenario.topology
+    period = top.communication_period_s
+    if p.sampled:
+        return [] if period is None else ["topology.communication_period_s: sampled laws exchange once per control period; leave it out"]
+    if period is None:
+        return ["topology.communication_period_s: missing; loss and delay need messages sent at instants"] if top.loss + top.delay_s > 0 else []
+    ratio = run.step_s / period
+    if min(abs(ratio - round(ratio)), abs(1 / ratio - round(1 / ratio))) > 1e-9:
+        return [f"topology.communication_period_s = {period:g}: must divide step_s = {run.step_s:g} or be a multiple of it"]
+    h = run.step_s / run.sub_steps
+    if abs(period / h - round(period / h)) > 1e-6:
+        return [f"topology.communication_period_s = {period:g}: must be a multiple of the integrator's step {h:g} s"]
+    return []
+
+
+def _disturbances_fit(p: Prepared) -> list[str]:
+    """Disturbances this law and plant cannot take, and what is wrong in themselves."""
+    scenario = p.scenario
+    found = disturbance.violations(scenario.disturbance, scenario.ids, scenario.run.seed, hasattr(p.law, "worst"))
+    for k, entry in enumerate(scenario.disturbance, 1):
+        if entry.on == "measurement" and not p.sampled:
+            found.append(f"disturbance[{k}].on = measurement: needs a sampled law; a continuous one has no instants to measure at")
+        if entry.on in ("input", "resistance") and scenario.plant.kind == "actuated_units":
+            found.append(f"disturbance[{k}].on = {entry.on}: not in actuated_units, which has [[fault]] and [plant] noise instead")
+    if scenario.fault and scenario.plant.kind != "actuated_units":
+        found.append(f"fault: the plant {scenario.plant.kind} has no actuators that fail; actuated_units has")
+    if scenario.plant.kind == "actuated_units":
+        found += p.plant.violations(p.plant_params, p.first_scene, scenario.fault)
+        if p.plant_params.noise_variance_m2_per_s6 > 0 and scenario.run.seed is None:
+            found.append("run.seed: missing; the plant's noise is random")
+    return found
+
+
+def _connected(p: Prepared) -> list[str]:
+    """Assumption of every law: the graph of a formation is connected. Trains alone on a track are formations of their own."""
+    links = p.first_scene.links
+    groups = graph.components(len(p.scenario.train), links.sender, links.receiver)
+    if p.plan.rule == "links" and len(groups) > 1:
+        named = " | ".join(", ".join(p.scenario.ids[i] for i in g) for g in groups)
+        return [f"topology: the graph of the [[link]] tables is not connected: {named}"]
+    return []

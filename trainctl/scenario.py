@@ -1,0 +1,510 @@
+"""One TOML file is one run: its tables, the rules each key must keep, and the words in which a mistake is told.
+
+A mistake is one line, ``file: key = value: rule``; all mistakes of a file come at once. Rules that need more than the file
+(the line, the law's start conditions) live in ``trainctl.check``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import importlib.resources
+import json
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
+
+from trainctl.errors import InputError
+from trainctl.plants.disturbance import Disturbance
+from trainctl.plants.faults import Fault
+from trainctl.reference import Profile
+from trainctl.signals import Bounds, Consists, Table
+
+SCHEMA_VERSION = 1
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Id = Annotated[int | str, AfterValidator(str)]
+PerUnit = float | tuple[float, ...]
+
+
+class Run(Table):
+    """[run]: time."""
+
+    duration_s: Positive = Field(description="Length of the run [s].")
+    step_s: Positive = Field(1.0, description="Step of the simulator T [s].")
+    control_period_s: Positive | None = Field(
+        None, description="Control period T_c of sampled laws [s], a multiple of step_s; default step_s."
+    )
+    sub_step_s: Positive = Field(0.01, description="Largest integration step inside a simulator step [s]; not used by the point plant.")
+    record_every_s: Positive | None = Field(
+        None, description="Time between recorded rows of trains, units and links [s]; default every step. Extremes stay exact."
+    )
+    seed: int | None = Field(None, ge=0, description="Seed of everything random; required as soon as something is.")
+
+    @model_validator(mode="after")
+    def _multiples(self) -> Run:
+        for key in ("duration_s", "control_period_s", "record_every_s"):
+            value = getattr(self, key)
+            if value is not None and abs(value / self.step_s - round(value / self.step_s)) > 1e-6:
+                raise ValueError(f"{key} = {value:g}: must be a multiple of step_s = {self.step_s:g}")
+        if abs(self.step_s * 1000 - round(self.step_s * 1000)) > 1e-9:
+            raise ValueError(f"step_s = {self.step_s:g}: SUMO counts time in whole milliseconds")
+        return self
+
+    @property
+    def steps(self) -> int:
+        """Number of simulator steps."""
+        return round(self.duration_s / self.step_s)
+
+    @property
+    def held_steps(self) -> int:
+        """Simulator steps per control period, m."""
+        return round((self.control_period_s or self.step_s) / self.step_s)
+
+    @property
+    def recorded_steps(self) -> int:
+        """Simulator steps between two recorded rows."""
+        return round((self.record_every_s or self.step_s) / self.step_s)
+
+    @property
+    def sub_steps(self) -> int:
+        """Integration steps per simulator step."""
+        return max(1, math.ceil(self.step_s / self.sub_step_s - 1e-9))
+
+
+class Network(Table):
+    """[network]: where the trains run; exactly one of the keys."""
+
+    line: str | None = Field(None, description="Name of a shipped line (see `trainctl net list`) or path of a line TOML.")
+    net: str | None = Field(None, description="Path of a SUMO net built by `trainctl net build`.")
+
+    @model_validator(mode="after")
+    def _one(self) -> Network:
+        if (self.line is None) == (self.net is None):
+            raise ValueError("give exactly one of line, net")
+        return self
+
+
+class BoundsTable(Table):
+    """[bounds]: what every train must keep; a [[train]] may state its own."""
+
+    speed_lower_mps: float | None = Field(None, description="Least speed [m/s].")
+    speed_upper_mps: float | None = Field(None, description="Greatest speed [m/s].")
+    input_lower_mps2: float | None = Field(None, description="Least input, applied force per mass [m/s2], negative.")
+    input_upper_mps2: float | None = Field(None, description="Greatest input, applied force per mass [m/s2].")
+    coupler_lower_m: float | None = Field(None, lt=0, description="Least coupler displacement (compression) [m], negative.")
+    coupler_upper_m: float | None = Field(None, gt=0, description="Greatest coupler displacement (stretch) [m].")
+
+
+class Topology(Table):
+    """[topology]: who hears whom, at which spacing."""
+
+    rule: Literal["same_track", "links"] = Field(
+        "same_track", description="same_track: neighbours on the same track hear each other; links: just the [[link]] tables."
+    )
+    desired: Literal["slots", "equal"] = Field(
+        "slots",
+        description="slots: every train keeps its place in the order of the [[train]] tables, a hole stays where one leaves; "
+        "equal: neighbours keep spacing_m, the hole closes.",
+    )
+    spacing_m: Positive | None = Field(None, description="Desired spacing of consecutive trains, front to front [m].")
+    lower_m: float | None = Field(None, description="Least spacing of consecutive trains, front to front [m]; default none.")
+    upper_m: Positive | None = Field(None, description="Greatest spacing of consecutive trains [m]; default none.")
+    weight: float = Field(1.0, description="Weight of links that state none (laws with weighted graphs).")
+    first_slot_m: float = Field(0.0, description="Wanted position of the first train relative to the reference [m].")
+    range_m: Positive | None = Field(None, description="Messages do not reach farther than this [m]; default unlimited.")
+    loss: float = Field(0.0, ge=0, lt=1, description="Probability that a message is lost, independent, seeded.")
+    delay_s: NotNegative = Field(0.0, description="Age of a message when it arrives [s], a multiple of the exchange period.")
+    communication_period_s: Positive | None = Field(
+        None,
+        description="Time between two messages of continuous laws [s]; default: exchanged in every instant, as their papers do.",
+    )
+
+
+class Link(Table):
+    """[[link]]: states one link's numbers; also makes the link where rule = "links" or extra = true."""
+
+    between: tuple[Id, Id] | None = Field(None, description="Two trains, the one ahead first, that hear each other.")
+    sender: Id | None = Field(None, description="With receiver, instead of between: a link in one direction.")
+    receiver: Id | None = Field(None, description="The train that hears.")
+    desired_m: float | None = Field(None, description="Desired x_first - x_second (sender - receiver) [m]; default from the slots.")
+    lower_m: float | None = Field(None, description="Least spacing [m]; default the sum over the consecutive links it spans.")
+    upper_m: float | None = Field(None, description="Greatest spacing [m]; default the sum over the consecutive links it spans.")
+    weight: float | None = Field(None, description="Weight a_ij of this link.")
+    extra: bool = Field(False, description="With rule = same_track: exists whenever both trains are on one track, neighbours or not.")
+
+    @model_validator(mode="after")
+    def _ends(self) -> Link:
+        pair = self.sender is not None and self.receiver is not None
+        if (self.between is None) == (not pair) or (self.between is not None and (self.sender or self.receiver)):
+            raise ValueError("give either between = [ahead, behind] or both sender and receiver")
+        first, second = self.ends
+        if first == second:
+            raise ValueError(f"joins train {first} with itself")
+        return self
+
+    @property
+    def ends(self) -> tuple[str, str]:
+        """(sender, receiver), or (ahead, behind)."""
+        return self.between or (self.sender or "", self.receiver or "")
+
+
+class TrainType(Table):
+    """[train_type.NAME]: fixed data of a train; a list gives each unit its own value, a number serves all."""
+
+    units: int = Field(1, ge=1, le=64, description="Number of power units (or carriages).")
+    unit_length_m: PerUnit = Field(0.0, description="Front of the unit to the front of the next, couplers at rest [m]; 0: a point.")
+    unit_mass_kg: PerUnit = Field(description="Mass [kg].")
+    rotating_mass_factor: PerUnit = Field(1.0, description="Inertia over mass, at least 1.")
+    c0_n_per_kg: PerUnit = Field(description="Davis resistance, constant part [N/kg].")
+    c1_ns_per_m_kg: PerUnit = Field(description="Davis resistance, linear part [N s/(m kg)].")
+    c2_ns2_per_m2_kg: PerUnit = Field(description="Davis resistance, square part [N s2/(m2 kg)].")
+    coupler_stiffness_n_per_m: PerUnit = Field(0.0, description="Stiffness of the coupler behind each unit but the last [N/m].")
+    coupler_damping_ns_per_m: PerUnit = Field(0.0, description="Damping of that coupler [N s/m].")
+    traction_n: PerUnit | None = Field(None, description="Greatest tractive effort [N]; default unlimited.")
+    traction_power_w: PerUnit | None = Field(None, description="Greatest traction power [W]; default unlimited.")
+    braking_n: PerUnit | None = Field(None, description="Greatest braking effort, positive [N]; default unlimited.")
+    braking_power_w: PerUnit | None = Field(None, description="Greatest braking power [W]; default unlimited.")
+    actuator_rate_per_s: PerUnit = Field(0.0, description="r of the actuator tau' = -r tau + r demand [1/s] (actuated_units).")
+
+    #: Keys whose list may be one shorter than the units: couplers.
+    _couplers = ("coupler_stiffness_n_per_m", "coupler_damping_ns_per_m")
+
+    @model_validator(mode="after")
+    def _per_unit(self) -> TrainType:
+        wrong = []
+        for key in type(self).model_fields:
+            value = getattr(self, key)
+            if key == "units" or value is None:
+                continue
+            if isinstance(value, tuple):
+                lengths = (self.units, self.units - 1) if key in self._couplers else (self.units,)
+                if len(value) not in lengths:
+                    wrong.append(f"{key} has {len(value)} values: units = {self.units} of them are needed (or one number for all)")
+            least = min(np.atleast_1d(value), default=0.0)
+            if key == "unit_mass_kg" and least <= 0:
+                wrong.append(f"{key} = {least:g}: must be above 0")
+            elif key == "rotating_mass_factor" and least < 1:
+                wrong.append(f"{key} = {least:g}: must be at least 1")
+            elif key in ("traction_n", "traction_power_w", "braking_n", "braking_power_w") and least <= 0:
+                wrong.append(f"{key} = {least:g}: must be above 0 (leave it out for no limit)")
+            elif least < 0:
+                wrong.append(f"{key} = {least:g}: must not be negative")
+        if self.units > 1 and min(np.atleast_1d(self.unit_length_m)) <= 0:
+            wrong.append("unit_length_m: a train of several units needs lengths above 0")
+        if wrong:
+            raise ValueError("; ".join(wrong))
+        return self
+
+    def per_unit(self, key: str, missing: float = math.inf) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """The key's value for every unit, shape (units,); couplers are padded with 0 behind the last unit."""
+        value = getattr(self, key)
+        if key in self._couplers:
+            row = np.zeros(self.units)
+            row[: self.units - 1] = value if not isinstance(value, tuple) else value[: self.units - 1]
+            return row
+        return np.full(self.units, missing) if value is None else np.broadcast_to(np.asarray(value, float), self.units).copy()
+
+
+class Train(Table):
+    """[[train]]: one train, in the order of the formation, front first."""
+
+    id: Id = Field(description="Name of the train; SUMO's vehicle id.")
+    type: str = Field(description="Name of a [train_type.NAME] table.")
+    track: Id = Field(description="Track it starts on.")
+    position_m: float = Field(description="Position of its front on the line [m].")
+    speed_mps: NotNegative = Field(description="Speed [m/s].")
+    unit_speed_mps: tuple[float, ...] | None = Field(None, description="Speed of each unit [m/s]; default speed_mps.")
+    coupler_m: tuple[float, ...] | None = Field(None, description="Displacement of each coupler at the start [m]; default at rest.")
+    speed_lower_mps: float | None = Field(None, description="Own least speed instead of [bounds] [m/s].")
+    speed_upper_mps: float | None = Field(None, description="Own greatest speed instead of [bounds] [m/s].")
+    input_lower_mps2: float | None = Field(None, description="Own least input instead of [bounds] [m/s2].")
+    input_upper_mps2: float | None = Field(None, description="Own greatest input instead of [bounds] [m/s2].")
+
+
+class Event(Table):
+    """[[event]]: something that happens at a time or place."""
+
+    kind: Literal["reroute"] = Field(description="reroute: the train takes a crossover to another track and stays there.")
+    train: Id = Field(description="The train.")
+    crossover: str | None = Field(None, description="Id of the crossover (see `trainctl net show`); default: the next one to to_track.")
+    to_track: Id | None = Field(None, description="Track to change to, if no crossover is named.")
+    time_s: NotNegative = Field(0.0, description="When the route is ordered [s]; the train changes track when it gets there.")
+
+    @model_validator(mode="after")
+    def _where(self) -> Event:
+        if (self.crossover is None) == (self.to_track is None):
+            raise ValueError("give exactly one of crossover, to_track")
+        return self
+
+
+class Module(Table):
+    """A table whose further keys belong to the module it names."""
+
+    model_config = {**Table.model_config, "extra": "allow"}
+
+    def keys(self) -> dict[str, Any]:
+        """The further keys, as read."""
+        return dict(self.__pydantic_extra__ or {})
+
+
+class Controller(Module):
+    """[controller]: the law and its parameters (`trainctl schema --law NAME`)."""
+
+    law: str = Field(description="Module in trainctl.controllers, or the name of an entry point `trainctl.controllers`.")
+
+
+class Observer(Module):
+    """[observer]: for laws that need one."""
+
+    kind: str = Field("none", description="Module in trainctl.observers.")
+
+
+class Plant(Module):
+    """[plant]: what moves the trains."""
+
+    kind: Literal["point", "coupled_units", "actuated_units"] = Field("point", description="Module in trainctl.plants.")
+
+
+class Scenario(Table):
+    """A whole scenario file."""
+
+    schema_version: Literal[1] = Field(description="Version of this format.")
+    title: str = Field(description="One line: what the run shows.")
+    run: Run
+    network: Network
+    controller: Controller
+    observer: Observer = Observer()
+    plant: Plant = Plant()
+    reference: Profile
+    bounds: BoundsTable = BoundsTable()
+    topology: Topology = Topology()
+    train_type: dict[str, TrainType]
+    train: tuple[Train, ...] = Field(min_length=1)
+    link: tuple[Link, ...] = ()
+    event: tuple[Event, ...] = ()
+    disturbance: tuple[Disturbance, ...] = ()
+    fault: tuple[Fault, ...] = ()
+
+    @field_validator("train")
+    @classmethod
+    def _unique(cls, trains: tuple[Train, ...]) -> tuple[Train, ...]:
+        ids = [t.id for t in trains]
+        twice = sorted({i for i in ids if ids.count(i) > 1})
+        if twice:
+            raise ValueError(f"id {', '.join(twice)} stands more than once")
+        return trains
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Train ids in formation order."""
+        return tuple(t.id for t in self.train)
+
+    def cross_references(self) -> list[str]:
+        """Mistakes between tables of this file: names that do not exist, lists of the wrong length."""
+        found = []
+        ids, types = self.ids, self.train_type
+        for t in self.train:
+            if t.type not in types:
+                found.append(f"train[{t.id}].type = {t.type}: no [train_type.{t.type}]; there are: {', '.join(types)}")
+                continue
+            units = types[t.type].units
+            if t.unit_speed_mps is not None and len(t.unit_speed_mps) != units:
+                found.append(f"train[{t.id}].unit_speed_mps: has {len(t.unit_speed_mps)} values, the type has {units} units")
+            if t.coupler_m is not None and len(t.coupler_m) != units - 1:
+                found.append(f"train[{t.id}].coupler_m: has {len(t.coupler_m)} values, the type has {units - 1} couplers")
+        for k, link in enumerate(self.link, 1):
+            found += [f"link[{k}]: train {i} does not exist; there are: {', '.join(ids)}" for i in link.ends if i not in ids]
+        for k, event in enumerate(self.event, 1):
+            if event.train not in ids:
+                found.append(f"event[{k}].train = {event.train}: no such train; there are: {', '.join(ids)}")
+        if self.topology.loss > 0 and self.run.seed is None:
+            found.append(f"topology.loss = {self.topology.loss:g}: losses are random, so the run needs [run] seed")
+        if self.plant.kind == "point":
+            many = sorted({t.type for t in self.train if t.type in types and types[t.type].units > 1})
+            found += [f"train_type.{name}.units = {types[name].units}: the point plant has one unit per train" for name in many]
+        return found
+
+    def consists(self) -> Consists:
+        """Fixed data of all trains as arrays."""
+        types = [self.train_type[t.type] for t in self.train]
+
+        def rows(key: str) -> Any:
+            return np.concatenate([k.per_unit(key) for k in types])
+
+        return Consists(
+            first=np.concatenate([[0], np.cumsum([k.units for k in types])]).astype(np.int64),
+            length=rows("unit_length_m"),
+            mass=rows("unit_mass_kg"),
+            rotating=rows("rotating_mass_factor"),
+            davis=np.ascontiguousarray(np.stack([rows("c0_n_per_kg"), rows("c1_ns_per_m_kg"), rows("c2_ns2_per_m2_kg")], axis=1)),
+            stiffness=rows("coupler_stiffness_n_per_m"),
+            damping=rows("coupler_damping_ns_per_m"),
+            traction=rows("traction_n"),
+            traction_power=rows("traction_power_w"),
+            braking=rows("braking_n"),
+            braking_power=rows("braking_power_w"),
+            actuator_rate=rows("actuator_rate_per_s"),
+        )
+
+    def bounds_of_trains(self) -> Bounds:
+        """[bounds] with each train's own values, infinite where nothing is said."""
+
+        def row(key: str, missing: float) -> Any:
+            own = [getattr(t, key) if getattr(t, key) is not None else getattr(self.bounds, key) for t in self.train]
+            return np.array([missing if v is None else v for v in own], float)
+
+        return Bounds(
+            speed_lower=row("speed_lower_mps", -math.inf),
+            speed_upper=row("speed_upper_mps", math.inf),
+            input_lower=row("input_lower_mps2", -math.inf),
+            input_upper=row("input_upper_mps2", math.inf),
+        )
+
+    def toml(self) -> str:
+        """The scenario as resolved, as TOML text."""
+        import tomli_w
+
+        return tomli_w.dumps(_without_none(self.model_dump(mode="json")))
+
+    def hash(self) -> str:
+        """SHA-256 of the resolved scenario."""
+        return hashlib.sha256(self.toml().encode()).hexdigest()
+
+
+def _without_none(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _without_none(v) for k, v in value.items() if v is not None}
+    if isinstance(value, list):
+        return [_without_none(v) for v in value]
+    return value
+
+
+def shipped() -> dict[str, Path]:
+    """Scenarios that come with the package: name -> file."""
+    inside = Path(str(importlib.resources.files("trainctl"))) / "shipped_scenarios"  # in an installed wheel
+    folder = inside if inside.is_dir() else Path(__file__).resolve().parent.parent / "scenarios"
+    return {p.stem: p for p in sorted(folder.glob("*.toml"))}
+
+
+def find(name: str) -> Path:
+    """The file of a shipped scenario's name or of a path."""
+    path = Path(name)
+    if path.suffix == ".toml" or path.exists():
+        if not path.is_file():
+            raise InputError(f"{name}: no such scenario file")
+        return path
+    known = shipped()
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        raise InputError(f"{name}: no such scenario (see `trainctl list`) and no such file{hint}")
+    return known[name]
+
+
+def load(name: str, overrides: dict[str, Any] | None = None) -> tuple[Scenario, Path]:
+    """Read a scenario by name or path, with ``{"run.duration_s": 60}``-like overrides.
+
+    Raises
+    ------
+    InputError
+        With one line per mistake.
+    """
+    path = find(name)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path.name}: not a TOML file: {error}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    for key, value in (overrides or {}).items():
+        _set(data, key, value)
+    return parse(data, path.name), path
+
+
+def _set(data: dict[str, Any], key: str, value: Any) -> None:
+    *parents, last = key.split(".")
+    table: Any = data
+    for part in parents:
+        table = table.setdefault(part, {}) if isinstance(table, dict) else table
+    if not isinstance(table, dict):
+        raise InputError(f"--set {key}: {'.'.join(parents)} is not a table")
+    table[last] = value
+
+
+def parse(data: dict[str, Any], file: str) -> Scenario:
+    """Validate the tables of a scenario; ``file`` names it in the mistakes."""
+    try:
+        # JSON has the same types as TOML but for dates, and lets arrays stand for tuples under strict rules.
+        scenario = Scenario.model_validate_json(json.dumps(data, default=str))
+    except ValidationError as error:
+        raise InputError([f"{file}: {line}" for line in mistakes(error, data)]) from None
+    found = scenario.cross_references()
+    if found:
+        raise InputError([f"{file}: {line}" for line in found])
+    return scenario
+
+
+def mistakes(error: ValidationError, data: dict[str, Any], under: str = "") -> list[str]:
+    """One line per mistake pydantic found: ``key = value: rule``."""
+    lines = []
+    for e in error.errors(include_url=False):
+        loc = list(e["loc"])
+        key = _key(loc, data)
+        key = f"{under}.{key}" if under and key else under or key
+        value = e["input"]
+        if e["type"] == "extra_forbidden":
+            known = _known(loc)
+            near = difflib.get_close_matches(str(loc[-1]), known, n=1)
+            rule = "unknown key" + (f"; did you mean {near[0]}?" if near else "") + (f"; known: {', '.join(known)}" if known else "")
+            lines.append(f"{key}: {rule}")
+        elif e["type"] == "missing":
+            lines.append(f"{key}: missing")
+        elif e["type"] == "value_error":
+            rule = str(e["ctx"]["error"]) if "ctx" in e else e["msg"]
+            lines += [f"{key}: {r}" for r in rule.split("; ")] if "; " in rule and "=" in rule else [f"{key}: {rule}"]
+        else:
+            shown = value if not isinstance(value, dict | list) else "..."
+            lines.append(f"{key} = {shown}: {e['msg'][0].lower()}{e['msg'][1:]}")
+    return list(dict.fromkeys(lines))
+
+
+_UNION_MEMBERS = {"int", "str", "float", "constrained-int", "constrained-float"}
+
+
+def _key(loc: list[Any], data: Any) -> str:
+    """Dotted key; trains by id, other lists by number from 1."""
+    text, here = "", data
+    for k, part in enumerate(loc):
+        if isinstance(part, int):
+            item = here[part] if isinstance(here, list) and part < len(here) else None
+            name = item.get("id", part + 1) if isinstance(item, dict) and loc[k - 1] == "train" else part + 1
+            text += f"[{name}]"
+            here = item
+        elif isinstance(here, dict) or here is None:
+            if part in _UNION_MEMBERS or str(part).startswith(("tuple[", "function-")):
+                continue
+            text += ("." if text else "") + str(part)
+            here = here.get(part) if isinstance(here, dict) else None
+    return text
+
+
+def _known(loc: list[Any]) -> list[str]:
+    """Keys the table at ``loc[:-1]`` has, for tables whose model stands in ``Scenario``."""
+    model: Any = Scenario
+    for part in loc[:-1]:
+        if isinstance(part, int):
+            continue
+        field = getattr(model, "model_fields", {}).get(part)
+        if field is None:
+            return list(TrainType.model_fields) if model is Scenario or loc[0] == "train_type" else []
+        model = field.annotation
+        for inner in getattr(model, "__args__", ()):
+            if hasattr(inner, "model_fields"):
+                model = inner
+    return list(getattr(model, "model_fields", {}))

@@ -1,0 +1,211 @@
+"""SUMO behind the loop: start, measure, command and step through libsumo. Nothing else in the package imports libsumo.
+
+The options below are not taste: each one switches off something of SUMO's that silently moves, holds back or removes a train
+(measured on SUMO 1.28).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import libsumo
+import numpy as np
+
+from sumo_net import Line
+from trainctl.errors import CouplingError, SimulatorError
+from trainctl.signals import Floats, Ints
+from trainctl.world import Seen, Start
+
+#: Speed mode 32 switches off every speed correction of SUMO's; each inserted train starts with all of them on (31).
+SPEED_MODE_FREE = 32
+
+#: What SUMO adds in one step is exact to rounding; anything beyond was somebody else.
+TOLERANCE_M = 1e-6
+
+OPTIONS = {
+    "time-to-teleport": "-1",  # a train held at speed 0 would teleport after 300 s
+    "collision.action": "warn",  # the default removes the train; gaps are the monitors' business
+    "collision.mingap-factor": "0",  # a gap below minGap is not yet a collision
+    "insertion-checks": "none",  # one train per block at insertion, even without signals: the second never appears
+    "default.speeddev": "0",
+    "no-step-log": "true",
+    "no-internal-links": "true",
+    "fcd-output": "fcd.parquet",
+    "fcd-output.distance": "true",
+    "tripinfo-output": "tripinfo.xml",
+    "tripinfo-output.write-unfinished": "true",
+    "summary-output": "summary.xml",
+    "statistic-output": "statistics.xml",
+    "collision-output": "collisions.xml",
+    "vehroute-output": "vehroute.xml",
+    "vehroute-output.write-unfinished": "true",
+    "precision": "9",
+    "log": "messages.log",
+    "no-warnings": "false",
+}
+
+
+def version() -> str:
+    """Version of SUMO, as ``1.28.0``."""
+    return str(libsumo.getVersion()[1]).removeprefix("SUMO ")
+
+
+def write_routes(start: Start, path: Path) -> None:
+    """The trains as SUMO vehicles: true lengths and carriages, no randomness, no limits of SUMO's own."""
+    types: dict[tuple[float, ...], str] = {}
+    rows = []
+    for i, name in enumerate(start.ids):
+        units = tuple(float(x) for x in start.unit_length[i])
+        kind = types.setdefault(units, f"train{len(types) + 1}")
+        route = " ".join(start.routes[i])
+        rows.append(
+            f'    <vehicle id={quoteattr(name)} type="{kind}" depart="0" departLane="0" insertionChecks="none"'
+            f' departPos="{float(start.lane_position[i])!r}" departSpeed="{float(start.speed[i])!r}">\n        <route edges="{route}"/>\n    </vehicle>\n'
+        )
+    with path.open("w", encoding="utf-8") as out:
+        out.write("<routes>\n")
+        for units, kind in types.items():
+            length = max(math.fsum(units), 1.0)  # SUMO has no points
+            out.write(
+                f'    <vType id="{kind}" vClass="rail" guiShape="rail" length="{length!r}" carriageLength="{max(max(units), 1.0)!r}"'
+                ' carriageGap="0" minGap="0" sigma="0" speedFactor="1" speedDev="0" maxSpeed="500" accel="100" decel="100"'
+                ' emergencyDecel="1000"/>\n'
+            )
+        out.writelines(rows)
+        out.write("</routes>\n")
+
+
+def write_configuration(folder: Path, net: str, routes: str, step: float, end: float) -> Path:
+    """``run.sumocfg``: SUMO's own sumo and sumo-gui open it."""
+    options = {"net-file": net, "route-files": routes, "begin": "0", "end": f"{end:.3f}", "step-length": f"{step:g}", **OPTIONS}
+    path = folder / "run.sumocfg"
+    body = "".join(f"    <{key} value={quoteattr(value)}/>\n" for key, value in options.items())
+    path.write_text(f"<configuration>\n{body}</configuration>\n", encoding="utf-8")
+    return path
+
+
+class Sumo:
+    """One libsumo simulation. ``folder`` receives SUMO's inputs and its own logs."""
+
+    def __init__(self, line: Line, net: Path, folder: Path, step: float, steps: int) -> None:
+        self.line, self.net, self.folder, self.time_step, self.steps = line, net, folder, step, steps
+        self.index = {e: k for k, e in enumerate(line.edges)}
+        self.began = False
+
+    def start(self, start: Start) -> None:
+        """Load the net, insert the trains, verify each of them, and take every speed correction off."""
+        if libsumo.simulation.isLoaded():
+            raise SimulatorError("SUMO already runs in this process; it can hold one simulation at a time")
+        write_routes(start, self.folder / "trains.rou.xml")
+        end = (self.steps + 1) * self.time_step
+        configuration = write_configuration(self.folder, self.net.name, "trains.rou.xml", self.time_step, end)
+        self.ids = list(start.ids)
+        self._call(libsumo.start, ["sumo", "-c", str(configuration)])
+        self.began = True
+        self._call(libsumo.simulationStep)
+        self._verify_insertion(start)
+        vehicle = libsumo.vehicle
+        for name in self.ids:
+            vehicle.setSpeedMode(name, SPEED_MODE_FREE)
+            vehicle.setLaneChangeMode(name, 0)
+        self.seen = self._read()
+
+    def _verify_insertion(self, start: Start) -> None:
+        present = set(libsumo.vehicle.getIDList())
+        wrong = []
+        for i, name in enumerate(self.ids):
+            if name not in present:
+                wrong.append(f"train {name} was not inserted on edge {self.line.edges[start.edge[i]]}")
+                continue
+            edge, where = libsumo.vehicle.getRoadID(name), libsumo.vehicle.getLanePosition(name)
+            speed = libsumo.vehicle.getSpeed(name)
+            if edge != self.line.edges[start.edge[i]] or abs(where - start.lane_position[i]) > TOLERANCE_M:
+                wanted = f"{self.line.edges[start.edge[i]]} at {start.lane_position[i]:.6f} m"
+                wrong.append(f"train {name} was inserted on {edge} at {where:.6f} m instead of {wanted}")
+            elif abs(speed - start.speed[i]) > TOLERANCE_M:
+                wrong.append(f"train {name} was inserted at {speed:.6f} m/s instead of {start.speed[i]:.6f} m/s")
+        if wrong:
+            raise CouplingError("; ".join(wrong))
+
+    def measure(self) -> Seen:
+        """Front positions on the line and edges."""
+        return self.seen
+
+    def _read(self) -> Seen:
+        road, lane_position = libsumo.vehicle.getRoadID, libsumo.vehicle.getLanePosition
+        edge: Ints = np.empty(len(self.ids), np.int64)
+        position: Floats = np.empty(len(self.ids))
+        try:
+            for i, name in enumerate(self.ids):
+                edge[i] = self.index[road(name)]
+                position[i] = lane_position(name)
+        except (libsumo.TraCIException, KeyError) as error:
+            raise CouplingError(f"train {name} is not on the line at {self._time():.3f} s: {error}; did it reach the line's end?") from None
+        position += self.line.start_m[edge]
+        return Seen(position, edge)
+
+    def route(self, train: int, edges: tuple[str, ...]) -> None:
+        """Give a train another route."""
+        self._call(libsumo.vehicle.setRoute, self.ids[train], list(edges))
+
+    def move(self, displacement: Floats, step: float) -> None:
+        """Command the mean speed of the step, displacement / T: SUMO's Euler update then moves the train by just that."""
+        command = libsumo.vehicle.setSpeed
+        before = self.seen.position
+        for name, speed in zip(self.ids, (displacement / step).tolist(), strict=True):
+            command(name, speed)
+        self._call(libsumo.simulationStep)
+        now = self.seen = self._read()
+        wrong = np.flatnonzero(np.abs(now.position - before - displacement) > TOLERANCE_M)
+        if len(wrong):
+            raise CouplingError("; ".join(self._explain(int(i), now, before, displacement) for i in wrong[:5]))
+
+    def _explain(self, i: int, now: Seen, before: Floats, displacement: Floats) -> str:
+        name, edge = self.ids[i], self.line.edges[now.edge[i]]
+        moved = now.position[i] - before[i]
+        cause = "unknown"
+        if libsumo.vehicle.getSpeedMode(name) != SPEED_MODE_FREE:
+            cause = f"its speed mode is {libsumo.vehicle.getSpeedMode(name)}, not {SPEED_MODE_FREE}: SUMO corrects its speed"
+        elif name in libsumo.simulation.getStartingTeleportIDList() or name in libsumo.simulation.getEndingTeleportIDList():
+            cause = "a teleport"
+        elif libsumo.vehicle.isStopped(name):
+            cause = "a stop"
+        elif moved < 1e-9:
+            cause = "it was held"
+        return (
+            f"train {name} on {edge} at {self._time():.3f} s moved {moved:.6f} m, commanded {displacement[i]:.6f} m:"
+            f" something else moved it (likely cause: {cause})"
+        )
+
+    def close(self) -> None:
+        """End the simulation; SUMO then completes its logs."""
+        if self.began:
+            self.began = False
+            libsumo.close()
+
+    def messages(self) -> list[tuple[float | None, str]]:
+        """Warnings and errors SUMO wrote, with the time it named, if any."""
+        log = self.folder / OPTIONS["log"]
+        if not log.is_file():
+            return []
+        found = []
+        for text in log.read_text(encoding="utf-8", errors="replace").splitlines():
+            if text.startswith(("Warning:", "Error:")):
+                at = re.search(r"time[= ]([0-9.]+)", text)
+                found.append((float(at.group(1).rstrip(".")) if at else None, text))
+        return found
+
+    def _time(self) -> float:
+        return float(libsumo.simulation.getTime()) - self.time_step
+
+    def _call(self, function: Any, *arguments: Any) -> Any:
+        """libsumo's own errors in the project's words."""
+        try:
+            return function(*arguments)
+        except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
+            where = f" at {self._time():.3f} s" if self.began and libsumo.simulation.isLoaded() else ""
+            raise SimulatorError(f"SUMO{where}: {error}") from None
