@@ -1,0 +1,417 @@
+"""Finite-time cooperative cruise of EMU groups: Wei, Ge and Wu, Control Theory & Applications 2022 (5).
+
+Every power unit is an agent: it hears its neighbours in the train, heads and tails hear the next train, and every head knows the
+virtual leader. With ``alpha_1 = 1`` this is the ordinary consensus the paper compares with.
+
+Symbols
+-------
+x, v         position of a unit's front [m], its speed [m/s]
+xt, vt       position and speed relative to the wanted ones (x, v with tilde), eq. (8)
+e            stretch of a coupler [m], eq. (1): difference of xt between its units
+s, ls, le    clear distance tail to head, its wanted value, the emergency distance [m], eq. (9)
+z            s - ls [m]: difference of xt between the tail ahead and the head behind
+k_hat        coupler stiffness per mass [1/s2]
+h1, h2       largest stretch and compression of a coupler [m]
+w            barrier weight of a coupler; a = w - k_hat / p1 is the paper's in-train weight
+b            weight between trains; beta the range of communication [m]
+delta1, delta2, gamma1, gamma2   widths of the zones where w and b leave 1 [m]
+zeta, beta_hat                   ls - le and beta - ls [m]
+p1..p4, mu1, mu2                 gains of eq. (13)
+alpha1, alpha2                   its exponents, alpha2 = 2 alpha1 / (1 + alpha1)
+
+Corrections to the print: (8) counts the full length of the trains ahead and of the units ahead in the train; (9) has xt twice, so s
+is the clear distance; the compression branch of w holds for both units of a pair, as Lemma 1 needs, and so does the branch b = 0;
+weights are taken at most 1 mm inside the coupler's range and 1 m short of the emergency distance, where the print leaves them
+undefined. Every head is pinned, as printed. ls belongs to each pair of trains: longer where a train left and its slot is kept.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numba import njit
+from pydantic import Field
+
+from trainctl.signals import POSITION, SPEED, Floats, Ints, Links, Scene, Table, leader_at
+
+CLOCK: Literal["continuous"] = "continuous"
+ORDER: Literal["parallel"] = "parallel"
+WATCHED = ("interval_m",)
+
+#: Columns of a message: head and tail relative to the leader (the tail moved forward by the units ahead of it), train length.
+HEAD, HEAD_SPEED, TAIL, TAIL_SPEED, LENGTH_OF_TRAIN = range(5)
+MESSAGE = 5
+
+#: Columns of ``Constants.units``.
+MASS, INERTIA, C0, C1, C2, LENGTH, K_HAT = range(7)
+
+#: How near to the ends of their ranges the weights are evaluated [m].
+COUPLER_MARGIN, INTERVAL_MARGIN = 1e-3, 1.0
+
+#: Classic Runge-Kutta is stable for rates up to this over the step.
+RUNGE_KUTTA_LIMIT = 2.785
+
+#: Speed differences [m/s] below which chatter is no matter: while a barrier acts, and settled.
+CHATTER_AT_BARRIER, CHATTER_SETTLED = 1e-2, 1e-4
+
+
+class Params(Table):
+    """Keys of ``[controller]`` for ``emu_finite_time``; the defaults are the paper's."""
+
+    alpha_1: float = Field(0.9, gt=0.0, le=1.0, description="Exponent of position terms, eq. (13); 1 is ordinary consensus")
+    p_1: float = Field(20.0, gt=0.0, description="Gain on positions in the train, eq. (13) [m^(1-alpha_1)/s2]")
+    p_2: float = Field(1e-4, gt=0.0, description="Gain on positions between trains, eq. (13) [m^(1-alpha_1)/s2]")
+    p_3: float = Field(10.0, gt=0.0, description="Gain on speeds in the train, eq. (13) [(m/s)^(1-alpha_2)/s]")
+    p_4: float = Field(1.0, gt=0.0, description="Gain on speeds between trains, eq. (13) [(m/s)^(1-alpha_2)/s]")
+    mu_1: float = Field(0.05, gt=0.0, description="Gain of a head on its position error, eq. (13) [m^(1-alpha_1)/s2]")
+    mu_2: float = Field(0.1, gt=0.0, description="Gain of a head on its speed error, eq. (13) [(m/s)^(1-alpha_2)/s]")
+    coupler_stretch_m: float = Field(0.1, gt=COUPLER_MARGIN, description="h1, largest stretch of a coupler [m], eq. (11)")
+    coupler_compression_m: float = Field(0.1, gt=COUPLER_MARGIN, description="h2, largest compression of a coupler [m], eq. (11)")
+    stretch_zone_m: float = Field(0.05, gt=0.0, description="delta1, width of the barrier before h1 [m]")
+    compression_zone_m: float = Field(0.03, gt=0.0, description="delta2, width of the barrier before h2 [m]")
+    emergency_distance_m: float = Field(1500.0, gt=0.0, description="le, clear distance that triggers an emergency brake [m]")
+    emergency_zone_m: float = Field(600.0, gt=0.0, description="gamma2, width of the barrier before the emergency distance [m]")
+    range_m: float = Field(10000.0, gt=0.0, description="beta, clear distance beyond which trains do not hear each other [m]")
+    range_zone_m: float = Field(1000.0, gt=0.0, description="gamma1, width over which the weight fades before the range [m]")
+
+
+class Constants(NamedTuple):
+    """Units, gains and zones."""
+
+    first: Ints  # (n + 1,)
+    units: Floats  # (U, 7) one column per constant named above
+    alpha1: float
+    alpha2: float
+    p1: float
+    p2: float
+    p3: float
+    p4: float
+    mu1: float
+    mu2: float
+    h1: float
+    h2: float
+    delta1: float
+    delta2: float
+    le: float
+    gamma2: float
+    beta: float
+    gamma1: float
+
+
+def constants(params: Params, scene: Scene) -> Constants:
+    """Pack gains and units; nothing in it depends on who hears whom."""
+    c = scene.consists
+    inertia = c.mass * c.rotating
+    units = np.column_stack([c.mass, inertia, c.davis, c.length, c.stiffness / inertia])
+    p = params
+    return Constants(
+        c.first, np.ascontiguousarray(units, dtype=np.float64), p.alpha_1, 2.0 * p.alpha_1 / (1.0 + p.alpha_1), p.p_1, p.p_2, p.p_3,
+        p.p_4, p.mu_1, p.mu_2, p.coupler_stretch_m, p.coupler_compression_m, p.stretch_zone_m, p.compression_zone_m,
+        p.emergency_distance_m, p.emergency_zone_m, p.range_m, p.range_zone_m,
+    )  # fmt: skip
+
+
+@njit(cache=True, inline="always")
+def sig(x: float, alpha: float) -> float:
+    """sign(x) |x|**alpha."""
+    return math.copysign(math.pow(abs(x), alpha), x)
+
+
+@njit(cache=True)
+def coupler_weight(e: float, h1: float, h2: float, delta1: float, delta2: float) -> float:
+    """Barrier weight w of a coupler at stretch ``e``: 1 inside, unbounded towards h1 and -h2."""
+    if e > h1 - delta1:
+        e = min(e, h1 - COUPLER_MARGIN)
+        return (2.0 * h1 - delta1) * delta1 / ((h1 - e) * (h1 + e))
+    if e < delta2 - h2:
+        e = max(e, COUPLER_MARGIN - h2)
+        return (delta2 / (h2 + e)) ** 2
+    return 1.0
+
+
+@njit(cache=True)
+def train_weight(z: float, ls: float, le: float, beta: float, gamma1: float, gamma2: float) -> float:
+    """Weight b between trains at clear distance ls + ``z``: 0 out of range, unbounded towards the emergency distance."""
+    zeta, beta_hat = ls - le, beta - ls
+    if z > beta_hat:
+        return 0.0
+    if z > beta_hat - gamma1:
+        return (beta_hat - abs(z)) / gamma1
+    if z <= gamma2 - zeta:
+        z = max(z, INTERVAL_MARGIN - zeta)
+        return (2.0 * zeta - gamma2) * gamma2 / ((zeta - z) * (zeta + z))
+    return 1.0
+
+
+@njit(cache=True)
+def demand(
+    i: int, constants: Constants, leader: Floats, age: float, slot: float, own: Floats, estimate: Floats, correction: Floats,
+    desired: Floats, heard: Floats, out: Floats,
+) -> None:  # fmt: skip
+    """Write the force of each unit of train ``i`` [N] into ``out``: eq. (13) times mass.
+
+    Parameters
+    ----------
+    i : int
+        The train.
+    constants : Constants
+        Of all trains.
+    leader : ndarray, shape (4,)
+        Position, speed, ... of the virtual leader.
+    slot : float
+        Wanted position of the head relative to the leader [m]; the offsets of eq. (8).
+    age, estimate, correction : float, ndarray, ndarray
+        Not used: held messages stay as they are, and there is no observer.
+    own : ndarray, shape (units, 2)
+        Position [m] and speed [m/s].
+    desired : ndarray, shape (k,)
+        Wanted spacing of each link, front to front, positive if the sender is ahead [m].
+    heard : ndarray, shape (k, 5)
+        Messages.
+    out : ndarray, shape (units,)
+        Force [N].
+
+    Notes
+    -----
+    The terms of a coupler are evaluated once and act on both its units. Where inertia is more than mass, inertia takes its place
+    but in the resistance.
+    """
+    c, units = constants, constants.units
+    start, last = c.first[i], len(out) - 1
+    k_p1 = 1.0 / c.p1
+    ahead = 0.0  # length of the units ahead in the train
+    for j in range(last + 1):
+        row = start + j
+        v = own[j, SPEED]
+        drag = units[row, C0] + (units[row, C1] + units[row, C2] * v) * v if v > 0.0 else 0.0
+        out[j] = units[row, MASS] * drag
+        if j < last:
+            ahead += units[row, LENGTH]
+    for j in range(last):
+        row = start + j
+        e = own[j, POSITION] - own[j + 1, POSITION] - units[row, LENGTH]
+        weight = coupler_weight(e, c.h1, c.h2, c.delta1, c.delta2) - k_p1 * units[row, K_HAT]
+        pull = units[row, INERTIA] * weight * (c.p1 * sig(e, c.alpha1) + c.p3 * sig(own[j, SPEED] - own[j + 1, SPEED], c.alpha2))
+        out[j] -= pull
+        out[j + 1] += pull
+    x_head, v_head = own[0, POSITION] - leader[0], own[0, SPEED] - leader[1]
+    x_tail, v_tail = own[last, POSITION] + ahead - leader[0], own[last, SPEED] - leader[1]
+    a_head = -(c.mu1 * sig(x_head - slot, c.alpha1) + c.mu2 * sig(v_head, c.alpha2))
+    a_tail = 0.0
+    for k in range(len(desired)):
+        if desired[k] > 0.0:  # the tail of the train ahead
+            z = heard[k, TAIL] - x_head - desired[k]
+            b = train_weight(z, desired[k] - heard[k, LENGTH_OF_TRAIN], c.le, c.beta, c.gamma1, c.gamma2)
+            if b > 0.0:
+                a_head += b * (c.p2 * sig(z, c.alpha1) + c.p4 * sig(heard[k, TAIL_SPEED] - v_head, c.alpha2))
+        else:  # the head of the train behind
+            z = x_tail - heard[k, HEAD] + desired[k]
+            ls = -desired[k] - ahead - units[start + last, LENGTH]
+            b = train_weight(z, ls, c.le, c.beta, c.gamma1, c.gamma2)
+            if b > 0.0:
+                a_tail += b * (c.p4 * sig(heard[k, HEAD_SPEED] - v_tail, c.alpha2) - c.p2 * sig(z, c.alpha1))
+    out[0] += units[start, INERTIA] * a_head
+    out[last] += units[start + last, INERTIA] * a_tail
+
+
+@njit(cache=True)
+def message(
+    i: int, constants: Constants, leader: Floats, slot: float, own: Floats, estimate: Floats, estimate_rate: Floats, out: Floats
+) -> None:
+    """Write what train ``i`` sends into ``out`` (5,): see ``HEAD`` and so on. All relative to the leader: old data do not lag."""
+    start, last = constants.first[i], len(own) - 1
+    ahead = 0.0
+    for j in range(last):
+        ahead += constants.units[start + j, LENGTH]
+    out[HEAD] = own[0, POSITION] - leader[0]
+    out[HEAD_SPEED] = own[0, SPEED] - leader[1]
+    out[TAIL] = own[last, POSITION] + ahead - leader[0]
+    out[TAIL_SPEED] = own[last, SPEED] - leader[1]
+    out[LENGTH_OF_TRAIN] = ahead + constants.units[start + last, LENGTH]
+
+
+@njit(cache=True)
+def watch(i: int, constants: Constants, leader: Floats, first: Ints, own: Floats, links: Links, out: Floats) -> None:
+    """Write the clear distance to the train ahead [m], eq. (9), into ``out`` (1,): NaN if train ``i`` hears none."""
+    out[0] = np.nan
+    for k in range(links.first[i], links.first[i + 1]):
+        if links.desired[k] > 0.0:
+            tail = first[links.sender[k] + 1] - 1
+            s = own[tail, POSITION] - constants.units[tail, LENGTH] - own[first[i], POSITION]
+            if not s >= out[0]:  # the first one, or a nearer one
+                out[0] = s
+
+
+def violations(params: Params, scene: Scene) -> list[str]:
+    """Say which hypotheses of Theorem 1, and which needs of the law, do not hold at the start."""
+    return [*broken_zones(params), *broken_trains(params, scene), *broken_links(params, scene), *broken_step(params, scene)]
+
+
+def broken_zones(params: Params) -> list[str]:
+    """Find zones that do not fit: delta1 in (0, h1), delta2 in (0, h2)."""
+    p, found = params, []
+    if p.stretch_zone_m >= p.coupler_stretch_m:
+        found.append(f"controller.stretch_zone_m = {p.stretch_zone_m:g}: must be below coupler_stretch_m = {p.coupler_stretch_m:g}")
+    if p.compression_zone_m >= p.coupler_compression_m:
+        found.append(
+            f"controller.compression_zone_m = {p.compression_zone_m:g}: must be below "
+            f"coupler_compression_m = {p.coupler_compression_m:g}"
+        )
+    return found
+
+
+def broken_trains(params: Params, scene: Scene) -> list[str]:
+    """Find trains of unequal units, with couplers stiffer than p1 or out of range, or without a slot."""
+    found = []
+    c, (h1, h2) = scene.consists, (params.coupler_stretch_m, params.coupler_compression_m)
+    inertia = c.mass * c.rotating
+    for i, (name, a, b) in enumerate(zip(scene.trains, c.first[:-1], c.first[1:], strict=True)):
+        if np.ptp(inertia[a:b]) > 1e-9 * inertia[a]:
+            found.append(
+                f"train {name}: unit_mass_kg times rotating_mass_factor = {inertia[a:b].min():g} to {inertia[a:b].max():g}: "
+                "the units of one train must be equally heavy, or neighbours do not pull each other alike (Lemma 1)"
+            )
+        k_hat = c.stiffness[a:b] / inertia[a:b]
+        if k_hat.max() >= params.p_1:
+            found.append(
+                f"controller.p_1 = {params.p_1:g}: must exceed coupler stiffness over mass, {k_hat.max():g} 1/s2 in train {name}, "
+                "or units repel each other"
+            )
+        stretch = scene.own[a : b - 1, POSITION] - scene.own[a + 1 : b, POSITION] - c.length[a : b - 1]
+        for j, e in enumerate(stretch):
+            if not -h2 < e < h1:
+                found.append(f"train {name}: coupler {j + 1} = {e:.4g} m: must start inside (-{h2:g}, {h1:g}) m (Theorem 1)")
+        if np.isnan(scene.links.slot[i]):
+            found.append(f'topology.desired: train {name} has no slot: the law needs one for every train; use desired = "slots"')
+    return found
+
+
+def broken_links(params: Params, scene: Scene) -> list[str]:
+    """Find pairs too near, out of their zones, against their slots, or heard one way only."""
+    found = []
+    links, first, length = scene.links, scene.consists.first, scene.consists.train_length()
+    le, beta = params.emergency_distance_m, params.range_m
+    pairs = set(zip(links.sender.tolist(), links.receiver.tolist(), strict=True))
+    for p, i, desired in zip(links.sender.tolist(), links.receiver.tolist(), links.desired, strict=True):
+        ahead, name = scene.trains[p], scene.trains[i]
+        if (i, p) not in pairs:
+            found.append(f"link {ahead} to {name}: train {ahead} must hear train {name}, too (the graph is undirected)")
+        if desired < 0.0 and (i, p) in pairs:
+            continue  # said once, for the follower
+        if desired == 0.0:
+            found.append(f"link {ahead} to {name}: desired_m = 0: one of the two must be ahead")
+            continue
+        front, rear = (p, i) if desired > 0.0 else (i, p)
+        where = f"trains {scene.trains[front]} and {scene.trains[rear]}"
+        ls = abs(desired) - length[front]
+        tail = first[front + 1] - 1
+        s = scene.own[tail, POSITION] - scene.consists.length[tail] - scene.own[first[rear], POSITION]
+        if not s > le:
+            found.append(f"{where}: interval = {s:.1f} m: must start above emergency_distance_m = {le:g} (Theorem 1)")
+        if not ls - le > params.emergency_zone_m:
+            found.append(
+                f"{where}: wanted interval = {ls:g} m: must exceed emergency_distance_m + emergency_zone_m = "
+                f"{le + params.emergency_zone_m:g}"
+            )
+        if not beta - ls > params.range_zone_m:
+            found.append(
+                f"{where}: wanted interval = {ls:g} m: must be below range_m - range_zone_m = {beta - params.range_zone_m:g}"
+            )
+        gap = abs(scene.links.slot[front] - scene.links.slot[rear] - abs(desired))
+        if gap > 1e-6:
+            found.append(f"{where}: desired_m = {abs(desired):g}: differs by {gap:g} m from what their slots say")
+    return found
+
+
+def broken_step(params: Params, scene: Scene) -> list[str]:
+    """Find a step that the in-train terms do not bear."""
+    if np.isnan(scene.links.slot).any() or not np.isfinite(scene.own).all():
+        return []
+    most = largest_sub_step(params, scene)
+    if scene.sub_step <= most:
+        return []
+    return [
+        f"run.sub_step_s = {scene.sub_step:g}: at most {math.floor(most * 1e4) / 1e4:g} s, or the in-train terms of the law "
+        "diverge (p_3 times the coupler weight this start leads to)"
+    ]
+
+
+def largest_sub_step(params: Params, scene: Scene) -> float:
+    """Estimate the largest Runge-Kutta step [s] that carries the law from this start.
+
+    Parameters
+    ----------
+    params : Params
+        Gains.
+    scene : Scene
+        Start, links and unit limits.
+
+    Returns
+    -------
+    float
+        Step [s].
+
+    Notes
+    -----
+    Ours, not the paper's. What stiffens the loop is p3 (w - k_hat / p1) sig(dv)^alpha2. What leader and neighbouring trains ask
+    of heads and tails at the start, within the units' limits, has to go through the couplers: in equilibrium p1 w sig(e)^alpha1 is
+    the acceleration a coupler passes on, which gives its w. The largest eigenvalue of the train's Laplacian with these weights,
+    times p3, times the slope of sig at a speed difference too small to matter, must stay below the limit of Runge-Kutta; so must
+    w = 1 with the slope at a much smaller one, settled.
+    """
+    c, first = constants(params, scene), scene.consists.first
+    fastest = 0.0
+    for i, (a, b) in enumerate(pairwise(first)):
+        if b - a < 2:
+            continue
+        asked = pulls(i, c, scene)
+        passed = np.cumsum(asked - asked.mean())[:-1]
+        e0 = scene.own[a : b - 1, POSITION] - scene.own[a + 1 : b, POSITION] - scene.consists.length[a : b - 1]
+        w = np.array([
+            max(weight_passing(f, c), coupler_weight(e, c.h1, c.h2, c.delta1, c.delta2)) for f, e in zip(passed, e0, strict=True)
+        ])  # fmt: skip
+        k_p1 = c.units[a : b - 1, K_HAT] / c.p1
+        for weights, chatter in ((w, CHATTER_AT_BARRIER), (np.ones_like(w), CHATTER_SETTLED)):
+            edges = np.diff(np.eye(b - a), axis=0)
+            stiffest = np.linalg.eigvalsh(edges.T @ np.diag(weights - k_p1) @ edges)[-1]
+            fastest = max(fastest, c.p3 * stiffest * c.alpha2 * chatter ** (c.alpha2 - 1.0))
+    return RUNGE_KUTTA_LIMIT / fastest if fastest > 0.0 else math.inf
+
+
+def pulls(i: int, c: Constants, scene: Scene) -> Floats:
+    """Acceleration [m/s2] asked of each unit of train ``i`` from outside the train, within its limits, couplers taken at rest."""
+    leader, none = np.zeros(4), np.zeros((0, 0))
+    leader_at(scene.reference, scene.time, scene.time, leader)
+    links, first, consists = scene.links, scene.consists.first, scene.consists
+    rows = range(links.first[i], links.first[i + 1])
+    heard = np.zeros((len(rows), MESSAGE))
+    for k, row in enumerate(rows):
+        p = links.sender[row]
+        message(p, c, leader, links.slot[p], np.ascontiguousarray(scene.own[first[p] : first[p + 1], :2]), none, none, heard[k])
+    a, b = first[i], first[i + 1]
+    rest = np.empty((b - a, 2))
+    rest[:, POSITION] = scene.own[a, POSITION] - np.concatenate(([0.0], np.cumsum(consists.length[a : b - 1])))
+    rest[:, SPEED] = v = scene.own[a, SPEED]
+    force = np.zeros(b - a)
+    desired = np.ascontiguousarray(links.desired[links.first[i] : links.first[i + 1]])
+    demand(i, c, leader, 0.0, links.slot[i], rest, none, none, desired, heard, force)
+    drag = c.units[a:b, MASS] * (c.units[a:b, C0] + (c.units[a:b, C1] + c.units[a:b, C2] * v) * v)
+    slow = max(v, 1.0)
+    traction = np.minimum(consists.traction[a:b], consists.traction_power[a:b] / slow)
+    braking = np.minimum(consists.braking[a:b], consists.braking_power[a:b] / slow)
+    return (np.clip(force, -braking, traction) - drag) / c.units[a:b, INERTIA]  # type: ignore[no-any-return]
+
+
+def weight_passing(f: float, c: Constants) -> float:
+    """Weight w of a coupler that passes on the acceleration ``f`` [m/s2] in equilibrium, stretched if positive."""
+    low, high = 0.0, (c.h1 if f > 0.0 else c.h2) - COUPLER_MARGIN
+    for _ in range(60):
+        e = 0.5 * (low + high)
+        if c.p1 * coupler_weight(math.copysign(e, f), c.h1, c.h2, c.delta1, c.delta2) * e**c.alpha1 < abs(f):
+            low = e
+        else:
+            high = e
+    return float(coupler_weight(math.copysign(high, f), c.h1, c.h2, c.delta1, c.delta2))
