@@ -40,7 +40,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Literal, NamedTuple
+from functools import partial
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -57,6 +58,9 @@ WATCHED = ("spacing_error_m", "speed_error_mps", "q_error_mps")
 OBSERVERS = ("asymptotic", "intermediate")
 X, V, W = 0, 1, 2
 X_RATE, V_RATE, W_DRIFT, UNCOMPENSATED, STATIC = 0, 1, 2, 3, 4
+
+#: ``njit`` as the integrator's: division as in numpy, no reference counts.
+compiled: Any = partial(njit, cache=True, error_model="numpy", _nrt=False)
 
 #: Classic Runge-Kutta is stable to 2.78; the rest is margin.
 STABLE = 2.5
@@ -82,13 +86,10 @@ class Constants(NamedTuple):
     """The law's constants. Lower bounds are signed (-rho2, ...)."""
 
     first: Ints  # (n + 1,)
-    length: Floats  # (U,) m, d_p behind each unit
-    inertia_per_rate: Floats  # (U,) kg s, m / r
+    units: Floats  # (U, 2) d_p behind each unit [m], m / r [kg s]
     offset: Floats  # (n,) m, front of the head to front of the tail at rest
-    distance: Floats  # (n, 2) m, -rho2, rho1
-    mixed: Floats  # (n, 2) m/s, -varrho2, varrho1
-    distance_kept: Floats  # (n, 2) m, the part of the range where the barrier is the printed one
-    mixed_kept: Floats  # (n, 2) m/s
+    distance: Floats  # (n, 4) m, -rho2, rho1, then the part between where the barrier is the printed one
+    mixed: Floats  # (n, 4) m/s, -varrho2, varrho1, alike
     l1: float
     l2: float
     l3: float
@@ -102,20 +103,20 @@ def constants(params: Params, scene: Scene) -> Constants:
     """Constants of the law; see ``ContinuousLaw``."""
     c, links = scene.consists, scene.links
     n = len(scene.trains)
-    distance = np.empty((n, 2))
+    distance, mixed = np.empty((n, 4)), np.empty((n, 4))
     for i in range(n):
         rows = slice(links.first[i], links.first[i + 1])
         k = ahead(links.desired[rows])
         if k < 0:
-            distance[i] = params.leader_error_lower_m, params.leader_error_upper_m
+            bounds = params.leader_error_lower_m, params.leader_error_upper_m
         else:
-            distance[i] = links.lower[rows][k] - links.desired[rows][k], links.upper[rows][k] - links.desired[rows][k]
-    mixed = np.array([mixed_bounds(params, *row) for row in distance])
+            bounds = links.lower[rows][k] - links.desired[rows][k], links.upper[rows][k] - links.desired[rows][k]
+        distance[i] = *bounds, 0.999 * bounds[0], 0.999 * bounds[1]
+        bounds = mixed_bounds(params, *bounds)
+        mixed[i] = *bounds, *resolved(params, *bounds, scene.sub_step)
     return Constants(
-        first=c.first, length=c.length, inertia_per_rate=c.mass * c.rotating / c.actuator_rate,
-        offset=c.train_length() - c.length[c.first[1:] - 1],
-        distance=distance, mixed=mixed, distance_kept=0.999 * distance,
-        mixed_kept=np.array([resolved(params, row[0], row[1], scene.sub_step) for row in mixed]),
+        first=c.first, units=np.column_stack([c.length, c.mass * c.rotating / c.actuator_rate]),
+        offset=c.train_length() - c.length[c.first[1:] - 1], distance=distance, mixed=mixed,
         l1=params.carriage_l1, l2=params.carriage_l2, l3=params.carriage_l3,
         ell1=params.head_l1_per_s, ell2=params.head_l2, ell3=params.head_l3, ell4=params.head_l4,
     )  # fmt: skip
@@ -137,13 +138,13 @@ def resolved(params: Params, lower: float, upper: float, step: float) -> tuple[f
         inside, outside = 0.0, 0.999
         for _ in range(40):
             share = 0.5 * (inside + outside)
-            slope = params.head_l2 + params.head_l3 * barrier(share * bound, lower, upper, lower, upper)[1]
+            slope = params.head_l2 + params.head_l3 * barrier(share * bound, np.array([lower, upper, lower, upper]))[1]
             inside, outside = (share, outside) if slope * slope * step <= 2.0 else (inside, share)
         kept.append(inside * bound)
     return kept[0], kept[1]
 
 
-@njit(cache=True)
+@compiled()
 def ahead(desired: Floats) -> int:
     """Row of the nearest train ahead among the links of one train, -1 if it hears none from ahead."""
     best = -1
@@ -153,10 +154,11 @@ def ahead(desired: Floats) -> int:
     return best
 
 
-@njit(cache=True)
-def barrier(e: float, lower: float, upper: float, kept_lower: float, kept_upper: float) -> tuple[float, float]:
-    """Product phi Phi of eqs. (34), (35) at ``e`` and its derivative; outside (kept_lower, kept_upper) with constant slope."""
-    at = min(max(e, kept_lower), kept_upper)
+@compiled()
+def barrier(e: float, bounds: Floats) -> tuple[float, float]:
+    """Product phi Phi of eqs. (34), (35) at ``e`` and its derivative, for one row of ``distance`` or ``mixed`` (4,)."""
+    lower, upper = bounds[0], bounds[1]
+    at = min(max(e, bounds[2]), bounds[3])
     below, above = at - lower, upper - at
     log = math.log((below / -lower) / (above / upper))
     both = 1.0 / below + 1.0 / above
@@ -164,7 +166,7 @@ def barrier(e: float, lower: float, upper: float, kept_lower: float, kept_upper:
     return log * both + slope * (e - at), slope
 
 
-@njit(cache=True)
+@compiled()
 def demand(
     i: int, constants: Constants, leader: Floats, age: float, slot: float, own: Floats, estimate: Floats, correction: Floats,
     desired: Floats, heard: Floats, out: Floats,
@@ -185,8 +187,8 @@ def demand(
 
     xt, vt, wt = x - own[0, POSITION], v - own[0, SPEED], w - estimate[0, W]
     qt = vt + c.ell1 * xt
-    phi_Phi, dphi_Phi = barrier(xt, c.distance[i, 0], c.distance[i, 1], c.distance_kept[i, 0], c.distance_kept[i, 1])
-    psi_Psi, dpsi_Psi = barrier(qt, c.mixed[i, 0], c.mixed[i, 1], c.mixed_kept[i, 0], c.mixed_kept[i, 1])
+    phi_Phi, dphi_Phi = barrier(xt, c.distance[i])
+    psi_Psi, dpsi_Psi = barrier(qt, c.mixed[i])
     beta1 = -phi_Phi - c.ell2 * qt - c.ell3 * psi_Psi
     beta1_v = -c.ell2 - c.ell3 * dpsi_Psi
     beta1_x = -dphi_Phi + c.ell1 * beta1_v
@@ -199,7 +201,7 @@ def demand(
     for j in range(len(out)):
         if j > 0:  # (29)-(32); w_rate is still that of the carriage in front
             kappa, damping = c.l1 + 1.0, c.l2 + 1.0 + (c.l1 + 1.0) ** 2
-            z1 = estimate[j, X] - estimate[j - 1, X] + c.length[first + j - 1]
+            z1 = estimate[j, X] - estimate[j - 1, X] + c.units[first + j - 1, 0]
             z2 = estimate[j, V] - estimate[j - 1, V] + kappa * z1
             alpha2 = -z1 - damping * z2 - kappa * (estimate[j, V] - estimate[j - 1, V]) + estimate[j - 1, W]
             z3 = estimate[j, W] - alpha2
@@ -209,11 +211,11 @@ def demand(
                 - (damping + kappa) * (correction[j, V_RATE] - correction[j - 1, V_RATE])
             )  # fmt: skip
         u = w_rate - (correction[j, W_DRIFT] - correction[j, UNCOMPENSATED])  # (33), (37)
-        out[j] = correction[j, STATIC] + c.inertia_per_rate[first + j] * u  # (5), over r
+        out[j] = correction[j, STATIC] + c.units[first + j, 1] * u  # (5), over r
         w_rate += correction[j, UNCOMPENSATED]  # hat w' of (13) with this u
 
 
-@njit(cache=True)
+@compiled()
 def message(
     i: int, constants: Constants, leader: Floats, slot: float, own: Floats, estimate: Floats, estimate_rate: Floats, out: Floats
 ) -> None:
@@ -225,7 +227,7 @@ def message(
     out[3] = estimate_rate[tail, W] - leader[3]
 
 
-@njit(cache=True)
+@compiled()
 def watch(i: int, constants: Constants, leader: Floats, first: Ints, own: Floats, links: Links, out: Floats) -> None:
     """Write xt, vt, qt of train ``i`` (3,)."""
     head, rows = first[i], slice(links.first[i], links.first[i + 1])
@@ -348,10 +350,10 @@ def _start(params: Params, scene: Scene) -> Iterator[str]:
     known = constants(params, scene)
     rates = []
     for i, (xt, vt, qt) in enumerate(errors(known, scene)):
-        for rule in inadmissible(params, float(xt), float(vt), *(float(b) for b in known.distance[i])):
+        for rule in inadmissible(params, float(xt), float(vt), float(known.distance[i, 0]), float(known.distance[i, 1])):
             yield f"train[{scene.trains[i]}] at {scene.time:g} s: {rule}, start condition (39)"
         if known.mixed[i, 0] < qt < known.mixed[i, 1]:
-            slope = params.head_l2 + params.head_l3 * barrier(qt, *known.mixed[i], *known.mixed[i])[1]
+            slope = params.head_l2 + params.head_l3 * barrier(qt, known.mixed[i])[1]
             rates.append(params.head_l1_per_s**2 + slope * slope + params.head_l4)
     if rates and max(rates) * h > STABLE:
         yield f"run.sub_step_s = {h:g}: too large for this start, {max(rates):.3g} 1/s times the step must not exceed {STABLE:g}"

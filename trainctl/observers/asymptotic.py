@@ -19,7 +19,7 @@ p              the observer's pole, n times
 Departures from [1]_
 --------------------
 * (17) prints D1 without ``-r v``. Its derivative must be B1, which contains ``-r``: without it the observer is unstable.
-* Backwards and at standstill the resistance is odd in v, as in the plant.
+* At standstill the resistance is zero, as in the plant.
 
 References
 ----------
@@ -31,13 +31,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, NamedTuple
+from functools import partial
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from pydantic import Field
 
-from trainctl.signals import POSITION, SPEED, Floats, Ints, Scene, Table
+from trainctl.signals import POSITION, SPEED, Consists, Floats, Ints, Scene, Table
 
 WIDTH = 6  # with one sinusoid; see width()
 CORRECTIONS = 5
@@ -63,16 +64,18 @@ class Params(Table):
     start_offset_speed_mps: float = Field(0.0, description="Error of the speed estimates at the start [m/s]; 0: as measured")
 
 
-class Train(NamedTuple):
-    """What the observer knows of the trains; (U,) but for ``first`` and ``davis`` (U, 3). Masses are inertias."""
+#: Columns of ``Train.units``. FRONT and REAR are B2 and B3 of eq. (4), b / m of the couplers before and behind [1/s].
+LENGTH, MASS, C0, C1, C2, STIFFNESS, DAMPING, RATE, FRONT, REAR = range(10)
 
-    first: Ints
-    length: Floats
-    mass: Floats
-    davis: Floats  # per inertia
-    stiffness: Floats
-    damping: Floats
-    rate: Floats
+#: ``njit`` as the integrator's: division as in numpy, no reference counts.
+compiled: Any = partial(njit, cache=True, error_model="numpy", _nrt=False)
+
+
+class Train(NamedTuple):
+    """What the observer knows of the trains. Masses are inertias, resistances are per inertia."""
+
+    first: Ints  # (n + 1,)
+    units: Floats  # (U, 10) one column per constant named above
 
 
 class Constants(NamedTuple):
@@ -171,18 +174,23 @@ def violations(params: Params, scene: Scene) -> list[str]:
     return found
 
 
-def train_of(scene: Scene) -> Train:
-    """What the observer knows of the trains."""
-    c = scene.consists
-    return Train(
-        c.first, c.length, c.mass * c.rotating, c.davis / c.rotating[:, None], c.stiffness, c.damping, c.actuator_rate
-    )  # fmt: skip
+def train_of(consists: Consists) -> Train:
+    """What the observer knows of the trains. A gradient is not among it: it is estimated with the constant fault."""
+    mass = consists.mass * consists.rotating
+    before = np.concatenate([[0.0], consists.damping[:-1]])
+    before[consists.first[:-1]] = 0.0
+    davis = consists.davis / consists.rotating[:, None]
+    units = np.column_stack([
+        consists.length, mass, davis, consists.stiffness, consists.damping, consists.actuator_rate, before / mass,
+        consists.damping / mass,
+    ])  # fmt: skip
+    return Train(consists.first, np.ascontiguousarray(units))
 
 
 def constants(params: Params, scene: Scene) -> Constants:
     """Return gains and model of all trains; call again when the trains change."""
-    train = train_of(scene)
-    models = [fault_model(params, m) for m in train.mass]
+    train = train_of(scene.consists)
+    models = [fault_model(params, m) for m in train.units[:, MASS]]
     solved = [gains(C, omega, params.pole_per_s) for C, omega in models]
     k1, k2, k3, _ = solved[0]
     return Constants(
@@ -199,46 +207,39 @@ def initial(params: Params, own: Floats) -> Floats:
     return estimate
 
 
-@njit(cache=True)
+@compiled()
 def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out: Floats) -> None:
     """Right-hand sides of (13) with the corrections (14), without the input; then the force of (5) at u = 0."""
     c, m = constants, constants.train
-    first, units = m.first[i], len(own)
-    for j in range(units):  # mu1, mu2; D1(v) - D1(v_hat) and its neighbours' D2, D3
-        u = first + j
-        ev = estimate[j, V] - own[j, SPEED]
+    first, last = m.first[i], len(own) - 1
+    for j in range(last + 1):  # mu1, mu2: D1(v) - D1(v_hat) with its neighbours' D2, D3
+        unit = m.units[first + j]
         v, vh = own[j, SPEED], estimate[j, V]
-        b_front, b_rear = (m.damping[u - 1] if j > 0 else 0.0), m.damping[u]
+        ev = vh - v
         # (17) prints no -r v; dD1/dv = B1 needs it
-        mu2 = ((b_front + b_rear) / m.mass[u] + m.davis[u, 1] + m.rate[u]) * ev + m.davis[u, 2] * (vh * abs(vh) - v * abs(v))
-        mu2 += c.k2 * ev
+        mu2 = (unit[FRONT] + unit[REAR] + unit[C1] + unit[RATE] + c.k2) * ev + unit[C2] * (vh * abs(vh) - v * abs(v))
         if j > 0:
-            mu2 -= b_front / m.mass[u] * (estimate[j - 1, V] - own[j - 1, SPEED])
-        if j + 1 < units:
-            mu2 -= b_rear / m.mass[u] * (estimate[j + 1, V] - own[j + 1, SPEED])
-        out[j, X_RATE] = estimate[j, V] - c.k1 * (estimate[j, X] - own[j, POSITION]) - ev
-        out[j, V_RATE] = mu2
-    for j in range(units):  # mu3 and the model; V_RATE still holds mu2
-        u = first + j
-        vh = estimate[j, V]
-        b_front, b_rear = (m.damping[u - 1] if j > 0 else 0.0), m.damping[u]
-        # B1(v) (w_hat + mu2) + (B1(v_hat) - B1(v)) (w_hat + mu2)
-        drift = own_coefficient(m, u, b_front + b_rear, vh) * (estimate[j, W] + out[j, V_RATE]) + c.k3 * (vh - own[j, SPEED])
+            mu2 -= unit[FRONT] * (estimate[j - 1, V] - own[j - 1, SPEED])
+        if j < last:
+            mu2 -= unit[REAR] * (estimate[j + 1, V] - own[j + 1, SPEED])
+        out[j, X_RATE] = v - c.k1 * (estimate[j, X] - own[j, POSITION])
+        out[j, V_RATE] = estimate[j, W] + mu2
+    for j in range(last + 1):  # mu3 and the model; the B1(v) w_hat of (13) and the three terms with B1 in mu3 add up to this
+        unit = m.units[first + j]
+        drift = own_coefficient(unit, estimate[j, V]) * out[j, V_RATE] + c.k3 * (estimate[j, V] - own[j, SPEED])
         if j > 0:
-            drift += b_front / m.mass[u] * (estimate[j - 1, W] + out[j - 1, V_RATE])
-        if j + 1 < units:
-            drift += b_rear / m.mass[u] * (estimate[j + 1, W] + out[j + 1, V_RATE])
+            drift += unit[FRONT] * out[j - 1, V_RATE]
+        if j < last:
+            drift += unit[REAR] * out[j + 1, V_RATE]
         fault = 0.0
         for q in range(c.C.shape[1]):
-            fault += c.C[u, q] * estimate[j, F + q]
+            fault += c.C[first + j, q] * estimate[j, F + q]
         out[j, W_DRIFT] = drift + fault
         out[j, UNCOMPENSATED] = (1.0 - c.compensated) * fault
-        out[j, STATIC] = static_force(m, u, j, units, own)
-    for j in range(units):
-        out[j, V_RATE] += estimate[j, W]
+    static_force(i, m, own, out)
 
 
-@njit(cache=True)
+@compiled()
 def rate(
     i: int, constants: Constants, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats
 ) -> None:
@@ -246,9 +247,10 @@ def rate(
     c, m = constants, constants.train
     for j in range(len(own)):
         u = m.first[i] + j
+        unit = m.units[u]
         out[j, X] = correction[j, X_RATE]
         out[j, V] = correction[j, V_RATE]
-        out[j, W] = correction[j, W_DRIFT] + m.rate[u] / m.mass[u] * (applied[j] - correction[j, STATIC])
+        out[j, W] = correction[j, W_DRIFT] + unit[RATE] / unit[MASS] * (applied[j] - correction[j, STATIC])
         ev = estimate[j, V] - own[j, SPEED]
         out[j, F] = c.k4[u, 0] * ev
         for q in range(len(c.omega)):
@@ -263,25 +265,26 @@ def fault_estimate(constants: Constants, estimate: Floats) -> Floats:
     return total
 
 
-@njit(cache=True, inline="always")
-def own_coefficient(m: Train, u: int, damping: float, v: float) -> float:
-    """B1 of eq. (4): how the acceleration of unit ``u`` damps itself [1/s]."""
-    B1: float = -damping / m.mass[u] - (m.davis[u, 1] + 2.0 * m.davis[u, 2] * abs(v)) - m.rate[u]
+@compiled(inline="always")
+def own_coefficient(unit: Floats, v: float) -> float:
+    """B1 of eq. (4): how the acceleration of a unit damps itself at this speed [1/s]."""
+    B1: float = -(unit[FRONT] + unit[REAR] + unit[C1] + 2.0 * unit[C2] * abs(v) + unit[RATE])
     return B1
 
 
-@njit(cache=True)
-def static_force(m: Train, u: int, j: int, units: int, own: Floats) -> float:
-    """Demand (5) at u = 0, as a force: B + m R - m B4 / r [N]."""
-    v = own[j, SPEED]
-    sign = 1.0 if v > 0.0 else (-1.0 if v < 0.0 else 0.0)
-    force: float = m.mass[u] * (sign * m.davis[u, 0] + m.davis[u, 1] * v + m.davis[u, 2] * v * abs(v))
-    if j + 1 < units:
-        closing = v - own[j + 1, SPEED]
-        force += m.stiffness[u] * (own[j, POSITION] - own[j + 1, POSITION] - m.length[u])
-        force += (m.damping[u] + m.stiffness[u] / m.rate[u]) * closing
-    if j > 0:
-        closing = own[j - 1, SPEED] - v
-        force -= m.stiffness[u - 1] * (own[j - 1, POSITION] - own[j, POSITION] - m.length[u - 1])
-        force -= (m.damping[u - 1] + m.stiffness[u - 1] / m.rate[u]) * closing
-    return force
+@compiled()
+def static_force(i: int, train: Train, own: Floats, out: Floats) -> None:
+    """Write the demand (5) at u = 0 as a force, B + m R - m B4 / r [N], into the column STATIC of ``out``."""
+    first, last = train.first[i], len(own) - 1
+    stretched = closing = 0.0  # force of the coupler before this unit [N], and a times its speed [N/s]
+    for j in range(last + 1):
+        unit = train.units[first + j]
+        v = own[j, SPEED]
+        rear = rear_closing = 0.0
+        if j < last:
+            dv = v - own[j + 1, SPEED]
+            rear = unit[STIFFNESS] * (own[j, POSITION] - own[j + 1, POSITION] - unit[LENGTH]) + unit[DAMPING] * dv
+            rear_closing = unit[STIFFNESS] * dv
+        resistance = unit[C0] + (unit[C1] + unit[C2] * v) * v if v > 0.0 else 0.0
+        out[j, STATIC] = rear - stretched + unit[MASS] * resistance + (rear_closing - closing) / unit[RATE]
+        stretched, closing = rear, rear_closing

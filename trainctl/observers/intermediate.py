@@ -23,10 +23,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from pydantic import Field
 
 from trainctl.observers.asymptotic import (
+    FRONT,
+    MASS,
+    RATE,
+    REAR,
     STATIC,
     UNCOMPENSATED,
     V_RATE,
@@ -36,6 +39,7 @@ from trainctl.observers.asymptotic import (
     V,
     W,
     X,
+    compiled,
     own_coefficient,
     static_force,
     train_of,
@@ -88,7 +92,7 @@ def violations(params: Params, scene: Scene) -> list[str]:
 
 def constants(params: Params, scene: Scene) -> Constants:
     """Return gains and model of all trains; call again when the trains change."""
-    return Constants(train_of(scene), params.position_gain_per_s, params.L1_per_s, params.L2_per_s2, params.kappa_per_s)
+    return Constants(train_of(scene.consists), params.position_gain_per_s, params.L1_per_s, params.L2_per_s2, params.kappa_per_s)
 
 
 def initial(params: Params, own: Floats) -> Floats:
@@ -99,40 +103,38 @@ def initial(params: Params, own: Floats) -> Floats:
     return estimate
 
 
-@njit(cache=True)
+@compiled()
 def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out: Floats) -> None:
     """Write right-hand sides without the input, as ``asymptotic.correction`` does: mu1 = -3 e_x, mu2 = -L1 e_v, mu3 = -L2 e_v."""
     c, m = constants, constants.train
-    units = len(own)
-    for j in range(units):
-        u = m.first[i] + j
-        ev = estimate[j, V] - own[j, SPEED]
-        wh = estimate[j, W]
-        b_front, b_rear = (m.damping[u - 1] if j > 0 else 0.0), m.damping[u]
-        model = own_coefficient(m, u, b_front + b_rear, own[j, SPEED]) * wh
+    first, last = m.first[i], len(own) - 1
+    for j in range(last + 1):
+        unit = m.units[first + j]
+        wh, ev = estimate[j, W], estimate[j, V] - own[j, SPEED]
+        model = own_coefficient(unit, own[j, SPEED]) * wh
         if j > 0:
-            model += b_front / m.mass[u] * estimate[j - 1, W]
-        if j + 1 < units:
-            model += b_rear / m.mass[u] * estimate[j + 1, W]
+            model += unit[FRONT] * estimate[j - 1, W]
+        if j < last:
+            model += unit[REAR] * estimate[j + 1, W]
         out[j, X_RATE] = estimate[j, V] - c.position_gain * (estimate[j, X] - own[j, POSITION])
         out[j, V_RATE] = wh - c.L1 * ev
         out[j, W_DRIFT] = model + estimate[j, XI] + c.kappa * wh - c.L2 * ev
         out[j, UNCOMPENSATED] = 0.0
-        out[j, STATIC] = static_force(m, u, j, units, own)
+    static_force(i, m, own, out)
 
 
-@njit(cache=True)
+@compiled()
 def rate(
     i: int, constants: Constants, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats
 ) -> None:
     """d(estimate)/dt; the input is what was applied after the limits."""
     c, m = constants, constants.train
     for j in range(len(own)):
-        u = m.first[i] + j
+        unit = m.units[m.first[i] + j]
         ev = estimate[j, V] - own[j, SPEED]
         out[j, X] = correction[j, X_RATE]
         out[j, V] = correction[j, V_RATE]
-        out[j, W] = correction[j, W_DRIFT] + m.rate[u] / m.mass[u] * (applied[j] - correction[j, STATIC])
+        out[j, W] = correction[j, W_DRIFT] + unit[RATE] / unit[MASS] * (applied[j] - correction[j, STATIC])
         out[j, XI] = -c.kappa * (out[j, W] + c.L2 * ev)  # model + f_hat + u, without mu3
 
 

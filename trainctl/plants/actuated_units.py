@@ -28,14 +28,37 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from pydantic import Field
 
+from trainctl.plants import coupled_units
+from trainctl.plants.coupled_units import (
+    BRAKING,
+    BRAKING_POWER,
+    C0,
+    C1,
+    C2,
+    DAMPING,
+    HOLD,
+    INERTIA,
+    LENGTH,
+    MASS,
+    PUSH,
+    STIFFNESS,
+    TRACTION,
+    TRACTION_POWER,
+    available,
+    running_resistance,
+    slope_at,
+)
 from trainctl.plants.faults import Fault, Faults, effectiveness, fault_rate, tabulated
 from trainctl.plants.faults import violations as fault_violations
-from trainctl.signals import FORCE, POSITION, SPEED, Consists, Floats, Scene, Table
+from trainctl.plants.integrate import bare
+from trainctl.signals import FORCE, GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Scene, Table
 
 STATES = 3
+
+#: Columns of ``Constants.units`` behind those of ``coupled_units``: actuator rate [1/s], noise in the jerk [m/s3].
+RATE, NOISE = PUSH + 1, PUSH + 2
 
 
 class Params(Table):
@@ -48,11 +71,12 @@ class Params(Table):
 
 
 class Constants(NamedTuple):
-    """The plant's constants. ``noise`` is overwritten in place whenever a new sample begins."""
+    """The plant's constants. Columns ``PUSH`` and ``NOISE`` of ``units`` may be overwritten in place between steps."""
 
-    consists: Consists
+    first: Ints  # (n + 1,)
+    units: Floats  # (U, 15) as in coupled_units, then RATE, NOISE
+    gradient: Floats  # (G, 2) as in coupled_units
     faults: Faults
-    noise: Floats  # (U,) m/s3
 
 
 def violations(params: Params, scene: Scene, faults: Sequence[Fault] = ()) -> list[str]:
@@ -71,10 +95,26 @@ def violations(params: Params, scene: Scene, faults: Sequence[Fault] = ()) -> li
     return found
 
 
-def constants(params: Params, scene: Scene, faults: Sequence[Fault] = ()) -> Constants:
-    """Return the plant's constants, with no noise yet."""
-    table = tabulated(faults, scene.trains, scene.consists)
-    return Constants(scene.consists, table, np.zeros(len(scene.consists.mass)))
+def constants(
+    params: Params, consists: Consists, gradient: Floats | None = None, resistance_factor: Floats | None = None,
+    faults: Sequence[Fault] = (), trains: Sequence[str] = (),
+) -> Constants:  # fmt: skip
+    """Pack the constants of all units, with no noise yet.
+
+    Parameters
+    ----------
+    params : Params
+        Not needed by the motion itself.
+    consists, gradient, resistance_factor
+        As in ``coupled_units``.
+    faults : sequence of Fault
+        That ``violations`` has not refused.
+    trains : sequence of str
+        Ids that the faults name, in the order of ``consists``.
+    """
+    first, units, slopes = coupled_units.constants(coupled_units.Params(), consists, gradient, resistance_factor)
+    units = np.column_stack([units, consists.actuator_rate, np.zeros(len(units))])
+    return Constants(first, np.ascontiguousarray(units), slopes, tabulated(faults, trains, consists))
 
 
 def noise(params: Params, seed: int, sample: int, units: int) -> Floats:
@@ -87,14 +127,14 @@ def noise(params: Params, seed: int, sample: int, units: int) -> Floats:
     seed : int
         Of the run.
     sample : int
-        Number of the interval: its start is ``sample * noise_hold_s``.
+        Number of the interval: it begins at ``sample * noise_hold_s``.
     units : int
         Of all trains.
 
     Returns
     -------
     ndarray, shape (units,)
-        [m/s3]
+        For the column ``NOISE`` of ``Constants.units`` [m/s3].
 
     Notes
     -----
@@ -105,37 +145,35 @@ def noise(params: Params, seed: int, sample: int, units: int) -> Floats:
     return math.sqrt(params.noise_variance_m2_per_s6) * draw
 
 
-def balanced(own: Floats, consists: Consists) -> Floats:
-    """Own states (U, 3) with the forces that hold the units' accelerations at 0 in this instant: tau(0) of the paper.
+def balanced(own: Floats, consists: Consists, gradient: Floats | None = None) -> Floats:
+    """Own states (U, 3) whose forces hold every unit's acceleration at 0 in this instant: tau(0) of the paper.
 
     Parameters
     ----------
     own : ndarray, shape (U, 2) or (U, 3)
         Positions [m] and speeds [m/s].
-    consists : Consists
-        Of all trains.
+    consists, gradient
+        As in ``constants``.
     """
     state = np.zeros((len(own), STATES))
     state[:, :FORCE] = own[:, :FORCE]
-    table = tabulated([], [], consists)
-    still = Constants(consists, table, np.zeros(len(own)))
+    still = constants(Params(), consists, gradient)
     out, power = np.zeros_like(state), np.zeros(6)
     for i in range(len(consists.first) - 1):
         rows = slice(consists.first[i], consists.first[i + 1])
         rate(i, still, 0.0, 0.0, state[rows], np.zeros(rows.stop - rows.start), out[rows], power)
-    state[:, FORCE] = -out[:, SPEED] * consists.mass * consists.rotating
+    state[:, FORCE] = np.where(state[:, SPEED] > 0.0, -out[:, SPEED] * consists.mass * consists.rotating, 0.0)
     return state
 
 
-@njit(cache=True)
+@bare(error_model="numpy")
 def limit(i: int, constants: Constants, own: Floats, applied: Floats) -> bool:
-    """Clip the demanded forces to effort and power of each unit; True if a limit acted."""
-    c = constants.consists
+    """Clip the demanded forces to effort and power of each unit, in place; True if one acted."""
     acted = False
     for j in range(len(applied)):
-        u = c.first[i] + j
-        v = max(abs(own[j, SPEED]), 1e-3)
-        high, low = min(c.traction[u], c.traction_power[u] / v), -min(c.braking[u], c.braking_power[u] / v)
+        row = constants.units[constants.first[i] + j]
+        high = available(own[j, SPEED], row[TRACTION], row[TRACTION_POWER])
+        low = -available(own[j, SPEED], row[BRAKING], row[BRAKING_POWER])
         if applied[j] > high:
             applied[j] = high
             acted = True
@@ -145,54 +183,65 @@ def limit(i: int, constants: Constants, own: Floats, applied: Floats) -> bool:
     return acted
 
 
-@njit(cache=True)
+@bare(error_model="numpy")
 def rate(
     i: int, constants: Constants, t: float, inside: float, own: Floats, applied: Floats, out: Floats, power: Floats
 ) -> None:
     """d(own)/dt, eqs. (1), (2), and the train's powers [W]: see ``signals.Plant``.
 
     Faults and noise act on the force, so they are part of traction and braking power.
+
+    Notes
+    -----
+    Departs from the paper: at standstill resistance is zero and a unit is held unless what acts on it drives it forward.
     """
-    c = constants.consists
-    for p in range(len(power)):
-        power[p] = 0.0
-    for j in range(len(applied)):
-        u = c.first[i] + j
+    a, last = constants.first[i], len(applied) - 1
+    traction = braking = resistance = damping = climb = disturbance = 0.0
+    pull = 0.0  # of the coupler before this unit
+    for j in range(last + 1):
+        unit = constants.units[a + j]
         v, tau = own[j, SPEED], own[j, FORCE]
-        inertia = c.mass[u] * c.rotating[u]
-        resistance = c.mass[u] * running_resistance(v, c.davis[u, 0], c.davis[u, 1], c.davis[u, 2])
+        rear = 0.0
+        if j < last:
+            closing = v - own[j + 1, SPEED]
+            rear = unit[STIFFNESS] * (own[j, POSITION] - own[j + 1, POSITION] - unit[LENGTH]) + unit[DAMPING] * closing
+            damping += unit[DAMPING] * closing * closing
+        drag = unit[MASS] * running_resistance(v, unit[C0], unit[C1], unit[C2])
+        weight = 0.0 if len(constants.gradient) == 0 else unit[MASS] * GRAVITY * slope_at(own[j, POSITION], constants.gradient)
+        push = unit[MASS] * unit[PUSH]
+        acceleration = (tau + pull - rear - drag - weight + push) / unit[INERTIA]
+        fault = fault_rate(constants.faults, a + j, t, inside) + unit[INERTIA] * unit[NOISE]
         out[j, POSITION] = v
-        out[j, SPEED] = tau - resistance
-        fault = fault_rate(constants.faults, u, t, inside)
-        share = effectiveness(constants.faults, u, inside)
-        out[j, FORCE] = c.actuator_rate[u] * (share * applied[j] - tau) + fault + inertia * constants.noise[u]
-        power[0] += max(tau * v, 0.0)
-        power[1] += max(-tau * v, 0.0)
-        power[2] += resistance * v
-    for j in range(len(applied) - 1):
-        u = c.first[i] + j
-        closing = own[j, SPEED] - own[j + 1, SPEED]
-        pull = c.stiffness[u] * (own[j, POSITION] - own[j + 1, POSITION] - c.length[u]) + c.damping[u] * closing
-        out[j, SPEED] -= pull
-        out[j + 1, SPEED] += pull
-        power[3] += c.damping[u] * closing * closing
-    for j in range(len(applied)):
-        u = c.first[i] + j
-        out[j, SPEED] /= c.mass[u] * c.rotating[u]
+        out[j, SPEED] = acceleration if v > 0.0 else max(acceleration, -HOLD * v)
+        out[j, FORCE] = unit[RATE] * (effectiveness(constants.faults, a + j, inside) * applied[j] - tau) + fault
+        traction += max(tau * v, 0.0)
+        braking += max(-tau * v, 0.0)
+        resistance += drag * v
+        climb += weight * v
+        disturbance += push * v
+        pull = rear
+    power[0] = traction
+    power[1] = braking
+    power[2] = resistance
+    power[3] = damping
+    power[4] = climb
+    power[5] = disturbance
 
 
-@njit(cache=True)
-def running_resistance(v: float, c0: float, c1: float, c2: float) -> float:
-    """Davis resistance [N/kg] against the motion. Departs from the paper at standstill and backwards, where it is odd."""
-    if v == 0.0:
-        return 0.0
-    return (c0 if v > 0.0 else -c0) + c1 * v + c2 * v * abs(v)
+def fault(constants: Constants, t: float, applied: Floats) -> Floats:
+    """What the faults do to the jerk of every unit [m/s3], for logs: f' of the paper and the demand that is lost.
 
-
-@njit(cache=True)
-def fault(constants: Constants, t: float, applied: Floats, out: Floats) -> None:
-    """Write what the faults do to the jerk of every unit [m/s3] into ``out`` (U,), for logs: f' of the paper plus lost demand."""
-    c = constants.consists
-    for u in range(len(out)):
-        lost = (1.0 - effectiveness(constants.faults, u, t)) * c.actuator_rate[u] * applied[u]
-        out[u] = (fault_rate(constants.faults, u, t, t) - lost) / (c.mass[u] * c.rotating[u])
+    Parameters
+    ----------
+    constants : Constants
+        Of the plant.
+    t : float
+        Time [s].
+    applied : ndarray, shape (U,)
+        Demanded forces after the limits [N].
+    """
+    out = np.empty(len(applied))
+    for u, unit in enumerate(constants.units):
+        lost = (1.0 - effectiveness(constants.faults, u, t)) * unit[RATE] * applied[u]
+        out[u] = (fault_rate(constants.faults, u, t, t) - lost) / unit[INERTIA]
+    return out

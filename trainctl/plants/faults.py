@@ -12,9 +12,9 @@ from itertools import combinations
 from typing import Annotated, Literal, NamedTuple, Self
 
 import numpy as np
-from numba import njit
 from pydantic import AfterValidator, Field, model_validator
 
+from trainctl.plants.integrate import bare
 from trainctl.signals import Consists, Floats, Ints, Table
 
 #: Keys each kind needs besides its place and window.
@@ -121,7 +121,7 @@ def tabulated(faults: Sequence[Fault], trains: Sequence[str], consists: Consists
     return Faults(*stacked(rate, 5), *stacked(loss, 3))
 
 
-@njit(cache=True)
+@bare(error_model="numpy")
 def fault_rate(faults: Faults, u: int, t: float, inside: float) -> float:
     """E f of unit ``u`` at ``t`` [N/s]; windows are open or shut as at ``inside``."""
     total = 0.0
@@ -134,7 +134,7 @@ def fault_rate(faults: Faults, u: int, t: float, inside: float) -> float:
     return total
 
 
-@njit(cache=True)
+@bare(error_model="numpy")
 def effectiveness(faults: Faults, u: int, inside: float) -> float:
     """Share of its demanded force that the actuator of unit ``u`` gives."""
     share = 1.0
