@@ -1,7 +1,7 @@
 """Robust constrained cooperative control under disturbances: Hu, Fan, Wei, Mathematics 2024, 12(13), 2003, eq. (6).
 
-Sampled, train level, directed weighted graphs. The clamps and the disturbances of eq. (4) are the plant's (``plants.point``); what the
-paper proves and what can be said instead is in ``robust_theory``.
+Sampled, train level, directed weighted graphs. The clamps and the disturbances of eq. (4) are the plant's (``plants.point``).
+What can be said of the final error is in ``robust_theory`` (the paper's Theorem 1) and ``robust_gain`` (what holds instead).
 
 Symbols
 -------
@@ -19,26 +19,27 @@ Notes
 -----
 Departs from the paper:
 
-* Every message is the position minus the reference's, so one that is one period old does not lag behind by v0 T per neighbour. Where all
-  messages are fresh this is eq. (6).
-* A lost message (the paper knows none): the last one is kept. In this frame that takes the silent neighbour to run on at v0, which it does
-  but for its own error, and the loop becomes one with a delay. Leaving the term out instead would leave a train that hears nobody without
-  any position to hold, and constant disturbances would carry it away without bound. A train that has never heard one of its neighbours does
-  not accelerate.
+* Every message is the position minus the reference's, so one that is one period old does not lag behind by v0 T per neighbour.
+  Where all messages are fresh this is eq. (6).
+* A lost message (the paper knows none): the last one is kept. In this frame that takes the silent neighbour to run on at v0, which
+  it does but for its own error, and the loop becomes one with a delay. Leaving the term out instead would leave a train that hears
+  nobody without any position to hold, and constant disturbances would carry it away without bound. A train that has never heard
+  one of its neighbours does not accelerate.
 * There is no spacing constraint: see ``warnings``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
 from scipy.sparse import csgraph
 
-from trainctl.controllers import robust_theory as theory
-from trainctl.signals import POSITION, SPEED, Demand, Floats, Links, Scene, Table, Trains
+from trainctl.controllers import robust_gain, robust_theory
+from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, Scene, Table, Trains
 
 CLOCK: Literal["sampled"] = "sampled"
 
@@ -120,13 +121,13 @@ def violations(params: Params, scene: Scene) -> list[str]:
     n = len(scene.trains)
     loop_faults = _gain_violations(params, scene) + _graph_violations(scene)
     found = loop_faults + _clamp_violations(scene) + _assumption_1(scene)
-    if not loop_faults and 1 < n <= theory.DENSE:
-        radius = theory.radius(theory.loop(gains(params, n), scene))
+    if not loop_faults and 1 < n <= robust_gain.DENSE:
+        radius = robust_gain.radius(robust_gain.loop(gains(params, n), scene))
         if radius >= 1.0:
-            strongest = theory.laplacian(n, scene.links).diagonal().max()
+            strongest = robust_gain.laplacian(n, scene.links).diagonal().max()
             found.append(
-                f"topology.weight = {scene.links.weight.max():g}: with h = {np.max(params.h_per_s):g} and T = {scene.control_period:g} s "
-                f"the loop is unstable without any disturbance (spectral radius {radius:.4f}); the weights one train hears with add up to "
+                f"topology.weight = {scene.links.weight.max():g}: the loop is unstable with h = {np.max(params.h_per_s):g} and "
+                f"T = {scene.control_period:g} s (spectral radius {radius:.4f}); the weights one train hears with add up to "
                 f"{strongest:g}, Assumption 2 needs less than h^2/4 = {gains(params, n).min() ** 2 / 4:.3g}"
             )
     return found
@@ -155,20 +156,20 @@ def _graph_violations(scene: Scene) -> list[str]:
         if not w > 0.0
     ]
     found += _not_connected(scene)
-    slot = theory.potentials(len(ids), links)
+    slot = robust_gain.potentials(len(ids), links)
     error = links.desired - (slot[links.sender] - slot[links.receiver])
     for k in np.flatnonzero(np.abs(error) > SPACING_ROUNDING)[:MOST]:
         s, r = links.sender[k], links.receiver[k]
         found.append(
-            f"link[{ids[s]} > {ids[r]}].desired_m = {links.desired[k]:g}: contradicts the other links, along which train {ids[s]} is "
-            f"{slot[s] - slot[r]:g} m from train {ids[r]}; d_ij = d_i - d_j must hold around every cycle"
+            f"link[{ids[s]} > {ids[r]}].desired_m = {links.desired[k]:g}: contradicts the other links, along which train {ids[s]} "
+            f"is {slot[s] - slot[r]:g} m from train {ids[r]}; d_ij = d_i - d_j must hold around every cycle"
         )
     return found
 
 
 def _not_connected(scene: Scene) -> list[str]:
     """Who cannot reach whom, one example per strongly connected part."""
-    ids, heard = scene.trains, theory.graph(len(scene.trains), scene.links).tocsr()
+    ids, heard = scene.trains, robust_gain.graph(len(scene.trains), scene.links).tocsr()
     parts, part = csgraph.connected_components(heard, connection="strong")
     if parts == 1:
         return []
@@ -184,47 +185,51 @@ def _not_connected(scene: Scene) -> list[str]:
 
 
 def _clamp_violations(scene: Scene) -> list[str]:
-    found, bounds, ids = [], scene.bounds, scene.trains
-    v0 = np.array([np.min(_speeds(scene)), np.max(_speeds(scene))])
-    for key, row in bounds._asdict().items():
-        unit = "mps2" if key.startswith("input") else "mps"
-        missing = [ids[i] for i in np.flatnonzero(~np.isfinite(row))]
-        if missing:
-            found.append(f"bounds.{key}_{unit}: missing for {_some([f'train {i}' for i in missing], ', ')}; the model (4) clamps every speed and input")
-    speed = scene.own[scene.consists.first[:-1], SPEED]
-    for i, name in enumerate(ids):
-        low, high = bounds.speed_lower[i], bounds.speed_upper[i]
-        if v0[1] >= high:
-            found.append(f"reference.speed_mps = {v0[1]:g}: must be below the maximum speed {high:g} m/s of train {name}")
-        if v0[0] <= low:
-            found.append(f"reference.speed_mps = {v0[0]:g}: must be above the least speed {low:g} m/s of train {name}")
-        if low < 0.0:
-            found.append(f"bounds.speed_lower_mps = {low:g}: train {name} must not run backwards; V = [0, theta_1]")
-        if not low <= speed[i] <= high:
-            found.append(f"train[{name}].speed_mps = {speed[i]:g}: outside the admissible speeds [{low:g}, {high:g}] m/s")
-        if bounds.input_lower[i] >= 0.0:
-            found.append(f"bounds.input_lower_mps2 = {bounds.input_lower[i]:g}: must be below 0 (train {name})")
-        if bounds.input_upper[i] <= 0.0:
-            found.append(f"bounds.input_upper_mps2 = {bounds.input_upper[i]:g}: must be above 0 (train {name})")
+    bounds, speeds = scene.bounds, _speeds(scene)
+    speed = robust_gain.heads(scene)[:, SPEED]
+    slowest, fastest = np.min(speeds), np.max(speeds)
+    found = []
+    for field, row in bounds._asdict().items():
+        key = f"bounds.{field}_{'mps2' if field.startswith('input') else 'mps'}"
+        found += _broken(scene, f"{key} =", row, ~np.isfinite(row), "must be given, the model (4) clamps every speed and input")
+        if field.endswith("upper"):
+            found += _broken(scene, f"{key} =", row, row <= 0.0, "must be above 0")
+    low, high = bounds.speed_lower, bounds.speed_upper
+    found += _broken(scene, f"reference.speed_mps = {fastest:g}: must be below the maximum speed", high, fastest >= high, "m/s")
+    found += _broken(scene, f"reference.speed_mps = {slowest:g}: must be above the least speed", low, slowest <= low, "m/s")
+    found += _broken(scene, "bounds.speed_lower_mps =", low, np.isfinite(low) & (low < 0.0), "must not be negative")
+    found += _broken(scene, "bounds.input_lower_mps2 =", bounds.input_lower, bounds.input_lower >= 0.0, "must be below 0")
+    found += _broken(scene, "train.speed_mps =", speed, (speed < low) | (speed > high), "outside the admissible speeds")
     return found
+
+
+def _broken(scene: Scene, key: str, value: Floats, broken: Bools, rule: str) -> list[str]:
+    """One line per different value for all trains it concerns."""
+    lines = []
+    for v in np.unique(value[broken]):
+        who = [scene.trains[i] for i in np.flatnonzero(broken & (value == v)).tolist()]
+        names = "all trains" if len(who) == len(scene.trains) else f"train {_some(who, ', ')}"
+        between = ": " if key.endswith("=") else " "
+        lines.append(f"{key} {v:g}{between}{rule} ({names})")
+    return lines
 
 
 def _assumption_1(scene: Scene) -> list[str]:
     found, bounds = [], scene.bounds
-    r = theory.greatest_resistance(scene)
+    r = robust_gain.greatest_resistance(scene)
     for i, name in enumerate(scene.trains):
         for key, value in (("input_upper", bounds.input_upper[i]), ("input_lower", -bounds.input_lower[i])):
             if np.isfinite(value) and np.isfinite(r[i]) and value > 0.0 and value <= KAPPA * r[i]:
                 sign = -value if key == "input_lower" else value
                 found.append(
-                    f"bounds.{key}_mps2 = {sign:g}: only {value / r[i]:.2f} times the running resistance {r[i]:.4f} m/s2 of train {name} "
+                    f"bounds.{key}_mps2 = {sign:g}: only {value / r[i]:.2f} times the resistance {r[i]:.4f} m/s2 of train {name} "
                     f"at {bounds.speed_upper[i]:g} m/s; Assumption 1 needs more than {KAPPA:g} times"
                 )
     return found
 
 
 def warnings(params: Params, scene: Scene, tracks: Sequence[int] | None = None) -> list[str]:
-    """What the law allows but the user should know, as ``key: warning``.
+    """List what the law allows but the user should know, as ``key: warning``.
 
     Parameters
     ----------
@@ -242,8 +247,8 @@ def warnings(params: Params, scene: Scene, tracks: Sequence[int] | None = None) 
     order = np.lexsort((-position, track))
     deaf = [
         f"{scene.trains[b]} does not hear {scene.trains[a]}"
-        for a, b in zip(order[:-1], order[1:], strict=True)
-        if track[a] == track[b] and (int(b), int(a)) not in hears
+        for a, b in pairwise(order.tolist())
+        if track[a] == track[b] and (b, a) not in hears
     ]
     if deaf:
         found.append(
@@ -256,14 +261,14 @@ def warnings(params: Params, scene: Scene, tracks: Sequence[int] | None = None) 
     return found
 
 
-def report(params: Params, scene: Scene, amplitude: Floats, constant: Floats | None = None) -> theory.Report:
+def report(params: Params, scene: Scene, amplitude: Floats, constant: Floats | None = None) -> robust_theory.Report:
     """Theorem 1, the l1 bound and the steady state for this scene; arguments as of ``robust_theory.report``."""
-    return theory.report(gains(params, len(scene.trains)), scene, amplitude, constant)
+    return robust_theory.report(gains(params, len(scene.trains)), scene, amplitude, constant)
 
 
 def worst_signs(params: Params, scene: Scene, plus: int, minus: int, steps: int) -> Floats:
-    """Signs of the worst disturbance for a pair of trains; see ``robust_theory.worst_signs``."""
-    return theory.worst_signs(theory.loop(gains(params, len(scene.trains)), scene), plus, minus, steps)
+    """Signs of the worst disturbance for a pair of trains; see ``robust_gain.worst_signs``."""
+    return robust_gain.worst_signs(robust_gain.loop(gains(params, len(scene.trains)), scene), plus, minus, steps)
 
 
 def _speeds(scene: Scene) -> Floats:

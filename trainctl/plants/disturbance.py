@@ -1,9 +1,10 @@
-"""Disturbances as scenario data, shared by all laws: the w1, w2, w3 of robust_constrained eqs. (1) and (4), an error of the resistance
-and noise of the measured positions.
+"""Disturbances as scenario data, shared by all laws.
 
-A disturbance is a pure function of the step, the time and the positions, so a resumed run continues with the same numbers. Random shapes
-are counter-based [1]_: the number of a train in a step depends on the seed, the entry, the train's id and the step, on nothing drawn before
-and not on which other trains there are.
+They are the w1, w2, w3 of robust_constrained eqs. (1) and (4), an error of the resistance, and noise of the measured positions.
+
+A disturbance is a pure function of the step, the time and the positions, so a resumed run continues with the same numbers. Random
+shapes are counter-based [1]_: the number of a train in a step depends on the seed, the entry, the train's id and the step, on
+nothing drawn before and not on which other trains there are.
 
 Amplitudes of ``position`` and ``speed`` are per simulator step T, as in the paper: 0.1 m each 0.8 s is not 0.1 m each second.
 
@@ -19,11 +20,11 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple, get_args
 
 import numpy as np
 from numba import njit
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 from pydantic.json_schema import SkipJsonSchema
 from pydantic_core import PydanticCustomError
 
@@ -36,7 +37,8 @@ POSITION, SPEED, INPUT, RESISTANCE, MEASUREMENT = range(5)
 #: Unit of the keys that carry one, per channel: ``amplitude_<unit>``, ``std_<unit>``; a resistance error is ``error_percent``.
 UNITS = ("m", "mps", "mps2", "percent", "m")
 
-SHAPES = ("constant", "alternating", "sine", "square", "uniform", "gaussian", "step", "gust", "table", "worst_case")
+Shape = Literal["constant", "alternating", "sine", "square", "uniform", "gaussian", "step", "gust", "table", "worst_case"]
+SHAPES: tuple[str, ...] = get_args(Shape)
 CONSTANT, ALTERNATING, SINE, SQUARE, UNIFORM, GAUSSIAN, STEP, GUST, TABLE, WORST_CASE = range(10)
 
 #: Keys that only some shapes take, with these shapes; the first shape listed with ``needed`` true also needs it.
@@ -70,7 +72,11 @@ def _no_unit(value: object) -> float:
     )
 
 
-Id = Annotated[int | str, AfterValidator(str)]
+def _name(value: int | str) -> str:
+    return str(value)
+
+
+Id = Annotated[str, BeforeValidator(_name, json_schema_input_type=int | str)]
 PerTrain = float | tuple[float, ...]
 WithoutUnit = SkipJsonSchema[Annotated[float | None, BeforeValidator(_no_unit)]]
 
@@ -79,19 +85,19 @@ class Disturbance(Table):
     """[[disturbance]]: one signal on one channel of some trains. Several entries on one channel add up."""
 
     on: Literal["position", "speed", "input", "resistance", "measurement"] = Field(
-        description="position: w1 [m] per step; speed: w2 [m/s] per step; input: w3 [m/s2], before the clamp; resistance: true over "
-        "believed resistance; measurement: what the trains believe their position to be. robust_constrained eqs. (1), (4)"
+        description="position: w1 [m] per step; speed: w2 [m/s] per step; input: w3 [m/s2], before the clamp; resistance: true "
+        "over believed resistance; measurement: what the trains believe their position to be. robust_constrained eqs. (1), (4)"
     )
     train: Id | tuple[Id, ...] = Field("all", description='Train, list of trains, or "all".')
-    shape: Literal["constant", "alternating", "sine", "square", "uniform", "gaussian", "step", "gust", "table", "worst_case"] = Field(
-        description="constant; alternating: sign changes every step; sine; square; uniform within the amplitude; gaussian; step: from "
-        "from_s on; gust: between from_m and to_m; table: values times the amplitude, one per step; worst_case: the signs that "
-        "drive the error of the pair highest at peak_s (l1 gain of the law's loop)."
+    shape: Shape = Field(
+        description="constant; alternating: sign changes every step; sine; square; uniform within the amplitude; gaussian; "
+        "step: from from_s on; gust: between from_m and to_m; table: values times the amplitude, one per step; worst_case: the "
+        "signs that drive the error of the pair highest at peak_s (l1 gain of the law's loop)."
     )
     amplitude_m: PerTrain | None = Field(None, description="position, measurement: amplitude [m], one number or one per train.")
     amplitude_mps: PerTrain | None = Field(None, description="speed: amplitude [m/s], one number or one per train.")
     amplitude_mps2: PerTrain | None = Field(None, description="input: amplitude [m/s2], one number or one per train.")
-    error_percent: PerTrain | None = Field(None, description="resistance: error of the believed one [%], one number or one per train.")
+    error_percent: PerTrain | None = Field(None, description="resistance: true less believed one [%], one number or one per train.")
     std_m: PerTrain | None = Field(None, description="gaussian on position, measurement: standard deviation [m].")
     std_mps: PerTrain | None = Field(None, description="gaussian on speed: standard deviation [m/s].")
     std_mps2: PerTrain | None = Field(None, description="gaussian on input: standard deviation [m/s2].")
@@ -129,7 +135,7 @@ class Disturbance(Table):
     @property
     def trains(self) -> tuple[str, ...]:
         """Trains named; ("all",) for all."""
-        return (self.train,) if isinstance(self.train, str) else tuple(str(t) for t in self.train)
+        return (self.train,) if isinstance(self.train, str) else self.train
 
     @model_validator(mode="after")
     def _keys_of_this_shape(self) -> Disturbance:
@@ -164,7 +170,7 @@ class Disturbance(Table):
         if self.trains != ("all",):
             for key in sorted(counted):
                 if len(getattr(self, key)) != len(self.trains):
-                    wrong.append(f"{key}: has {len(getattr(self, key))} values, train = {list(self.trains)} names {len(self.trains)}")
+                    wrong.append(f"{key} = {list(getattr(self, key))}: one value for each of train = {list(self.trains)} is needed")
         if wrong:
             raise ValueError("; ".join(wrong))
         return self
@@ -226,13 +232,15 @@ def violations(entries: Sequence[Disturbance], trains: Sequence[str], seed: int 
             if isinstance(value, tuple) and entry.trains == ("all",) and len(value) != len(trains):
                 found.append(f"{here}.{key} = {list(value)}: has {len(value)} values for {len(trains)} trains")
         if entry.shape in ONLY["seed"] and entry.seed is None and seed is None:
-            found.append(f"{here}.shape = {entry.shape}: is random, so it needs a seed: [run] seed or its own, or no run can be repeated")
+            found.append(f"{here}.shape = {entry.shape}: random, so it needs a seed, [run] seed or its own, to be repeatable")
         if entry.shape == "worst_case" and not worst:
             found.append(f"{here}.shape = worst_case: this law does not give its worst disturbance; use another shape or a table")
     return found
 
 
-def prepare(entries: Sequence[Disturbance], trains: Sequence[str], step: float, seed: int | None, worst: Worst | None = None) -> Signals:
+def prepare(
+    entries: Sequence[Disturbance], trains: Sequence[str], step: float, seed: int | None, worst: Worst | None = None
+) -> Signals:
     """Arrays of all disturbances of a run.
 
     Parameters
@@ -330,7 +338,7 @@ def _evaluate(whole: Ints, number: Floats, table: Floats, k: int, t: float, posi
             continue
         a = real[AMPLITUDE]
         shape = row[SHAPE]
-        if shape == CONSTANT or shape == STEP or shape == GUST:
+        if shape in (CONSTANT, STEP, GUST):
             value = a
         elif shape == ALTERNATING:
             value = a if (k - row[BEGIN]) % 2 == 0 else -a
@@ -339,7 +347,7 @@ def _evaluate(whole: Ints, number: Floats, table: Floats, k: int, t: float, posi
         elif shape == SQUARE:
             turn = (t - real[FROM_S]) / real[PERIOD] + real[PHASE] / (2.0 * math.pi) + ROUNDING
             value = a if turn % 1.0 < 0.5 else -a
-        elif shape == TABLE or shape == WORST_CASE:
+        elif shape in (TABLE, WORST_CASE):
             at = row[START] + k - row[BEGIN]
             value = a * table[at] if row[START] <= at < row[END] else 0.0
         else:
@@ -375,8 +383,8 @@ def philox(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, i
 def amplitudes(signals: Signals) -> Floats:
     """Greatest magnitude of the sum of all entries on each channel of each train, shape (5, n).
 
-    Windows in time and place are ignored, so overlapping or not, entries count in full; a Gaussian without an amplitude has no bound:
-    inf. The resistance row is a relative error, not a factor.
+    Windows in time and place are ignored: overlapping or not, entries count in full. A Gaussian without an amplitude has no
+    bound: inf. The resistance row is a relative error, not a factor.
     """
     out = np.zeros((len(CHANNELS), signals.trains))
     np.add.at(out, (signals.whole[:, ON], signals.whole[:, TRAIN]), np.abs(signals.number[:, AMPLITUDE]))
