@@ -160,7 +160,7 @@ def theorem_1(h: Floats, scene: Scene, amplitude: Floats) -> Theorem:
             f"even for eta2 -> 0, above b2lo = {b2_low[worst]:.4f}"
         )
         violated += [
-            f"Assumption 2: train {scene.trains[i]} has q = {q[i]:.4g}, even with eta2 = 1 it must be below h^2/4 = {h[i] ** 2 / 4:.4g}"
+            f"Assumption 2: train {scene.trains[i]} has q = {q[i]:.4g}, must be below h^2/4 = {h[i] ** 2 / 4:.4g} at eta2 = 1"
             for i in np.flatnonzero(q >= h**2 / 4).tolist()
         ]
     else:
