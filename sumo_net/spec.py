@@ -10,6 +10,7 @@ import difflib
 import math
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -52,7 +53,7 @@ def _word(value: Any) -> Any:
 
 def _allowed(characters: str) -> AfterValidator:
     def check(value: str) -> str:
-        if value and all(c.isascii() and c.isalnum() or c in characters for c in value) and value[0].isalnum():
+        if value and value[0] not in characters and all((c.isascii() and c.isalnum()) or c in characters for c in value):
             return value
         raise ValueError("must be letters, digits" + "".join(f" or {c}" for c in characters) + ", and begin with a letter or digit")
 
@@ -63,6 +64,12 @@ def _pair(value: Any) -> Any:
     if isinstance(value, list | tuple) and len(value) == 2:
         return tuple(value)
     raise ValueError("must be a pair [from_m, value]")
+
+
+def _not_empty(value: tuple[Any, ...]) -> tuple[Any, ...]:
+    if not value:
+        raise ValueError("must have at least one item")
+    return value
 
 
 TrackId = Annotated[str, BeforeValidator(_word), _allowed(".")]
@@ -120,14 +127,14 @@ class LineSpec(_Strict):
     """A line, as its TOML file describes it."""
 
     name: Word = Field(description="Name of the line; its files are called so.")
-    tracks: Annotated[tuple[TrackId, ...], Field(strict=False)] = Field(
-        min_length=1, description="Track ids in lateral order, left to right in the direction of travel."
+    tracks: Annotated[tuple[TrackId, ...], Field(strict=False), AfterValidator(_not_empty)] = Field(
+        description="Track ids in lateral order, left to right in the direction of travel."
     )
     length_m: float = Field(gt=0, le=1e7, description="Length of the line [m].")
     start_m: float = Field(0.0, ge=0, le=1e7, description="Kilometrage of its beginning [m], not negative.")
     max_edge_m: float = Field(5000.0, ge=10, description="No edge of a track is longer than this [m].")
-    speed: Annotated[tuple[SpeedFrom, ...], Field(strict=False)] = Field(
-        min_length=1, description="Speed limit: pairs [from_m, speed_mps], the first at start_m."
+    speed: Annotated[tuple[SpeedFrom, ...], Field(strict=False), AfterValidator(_not_empty)] = Field(
+        description="Speed limit: pairs [from_m, speed_mps], the first at start_m."
     )
     gradient: Annotated[tuple[GradientFrom, ...], Field(strict=False)] = Field(
         (), description="Gradient: pairs [from_m, permil], rising positive, within 50 per mil; level before the first."
@@ -153,7 +160,7 @@ class LineSpec(_Strict):
         r = self.regular_crossovers
         if r is None:
             return
-        pairs = [pair for a, b in zip(self.tracks, self.tracks[1:], strict=False) for pair in ((a, b), (b, a))]
+        pairs = [pair for a, b in pairwise(self.tracks) for pair in ((a, b), (b, a))]
         k = 0
         while (at := rounded(r.first_m + k * r.every_m)) + r.length_m <= self.end_m - SHORTEST_EDGE_M:
             for here, there in pairs:
@@ -254,13 +261,15 @@ def _healthy_part(error: ValidationError, data: dict[str, Any]) -> tuple[LineSpe
             bad.setdefault(str(key), set()).add(inside[0])
         else:
             rest.pop(str(key), None)
+    if "start_m" in data and "start_m" not in rest:
+        return None, {}
     numbers = {}
     for key in bad.keys() & rest.keys():
         good = [k for k in range(len(data[key])) if k not in bad[key]]
         rest[key] = [data[key][k] for k in good]
         numbers[key] = [k + 1 for k in good]
     if not rest.get("speed"):
-        rest["speed"] = [[rest.get("start_m", 0.0), 1.0]]
+        rest["speed"], numbers["speed"] = [[rest.get("start_m", 0.0), 1.0]], [1]
     try:
         return LineSpec.model_validate({"name": "line"} | rest), numbers
     except ValidationError:
@@ -373,7 +382,7 @@ def _meeting_violations(spec: LineSpec, numbers: Numbers) -> list[str]:
         ways.setdefault((c.from_track, c.to_track), []).append((c.start_m, c.end_m, label))
     for (here, there), pieces in ways.items():
         pieces.sort()
-        for (start, end, label), (next_start, _, other) in zip(pieces, pieces[1:], strict=False):
+        for (start, end, label), (next_start, _, other) in pairwise(pieces):
             if next_start < end:
                 what = "is the same as" if next_start == start else "overlaps"
                 found.append(f"{other}: {what} {label}, also from {here} to {there}, at {text(start)} to {text(end)} m")
@@ -383,8 +392,7 @@ def _meeting_violations(spec: LineSpec, numbers: Numbers) -> list[str]:
 def _close_cuts(spec: LineSpec) -> list[str]:
     found = []
     for track, reasons in spec.cuts().items():
-        places = sorted(reasons)
-        for a, b in zip(places, places[1:], strict=False):
+        for a, b in pairwise(sorted(reasons)):
             if rounded(b - a) < SHORTEST_EDGE_M:
                 rule = f"must be one place or at least {SHORTEST_EDGE_M:g} m apart, not {text(b - a)} m"
                 found.append(f"tracks = {track}: {reasons[a]} and {reasons[b]}: {rule}")
