@@ -39,6 +39,7 @@ from pydantic import Field
 from scipy.sparse import csgraph
 
 from trainctl.controllers import robust_gain, robust_theory
+from trainctl.errors import InputError
 from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, Scene, Table, Trains
 
 CLOCK: Literal["sampled"] = "sampled"
@@ -121,16 +122,22 @@ def violations(params: Params, scene: Scene) -> list[str]:
     n = len(scene.trains)
     loop_faults = _gain_violations(params, scene) + _graph_violations(scene)
     found = loop_faults + _clamp_violations(scene) + _assumption_1(scene)
-    if not loop_faults and 1 < n <= robust_gain.DENSE:
-        radius = robust_gain.radius(robust_gain.loop(gains(params, n), scene))
-        if radius >= 1.0:
-            strongest = robust_gain.laplacian(n, scene.links).diagonal().max()
-            found.append(
-                f"topology.weight = {scene.links.weight.max():g}: the loop is unstable with h = {np.max(params.h_per_s):g} and "
-                f"T = {scene.control_period:g} s (spectral radius {radius:.4f}); the weights one train hears with add up to "
-                f"{strongest:g}, Assumption 2 needs less than h^2/4 = {gains(params, n).min() ** 2 / 4:.3g}"
-            )
+    for members in robust_gain.formations(scene) if not loop_faults else []:
+        if 1 < len(members) <= robust_gain.DENSE:
+            found += _unstable(gains(params, n)[members], robust_gain.restrict(scene, members))
     return found
+
+
+def _unstable(h: Floats, scene: Scene) -> list[str]:
+    radius = robust_gain.radius(robust_gain.loop(h, scene))
+    if radius < 1.0:
+        return []
+    strongest = robust_gain.laplacian(len(h), scene.links).diagonal().max()
+    return [
+        f"topology.weight = {scene.links.weight.max():g}: the loop is unstable with h = {h.max():g} and T = {scene.control_period:g} s "
+        f"(spectral radius {radius:.4f}); the weights one train hears with add up to {strongest:g}, Assumption 2 needs less than "
+        f"h^2/4 = {h.min() ** 2 / 4:.3g}"
+    ]
 
 
 def _gain_violations(params: Params, scene: Scene) -> list[str]:
@@ -168,20 +175,18 @@ def _graph_violations(scene: Scene) -> list[str]:
 
 
 def _not_connected(scene: Scene) -> list[str]:
-    """Who cannot reach whom, one example per strongly connected part."""
+    """Who of one formation cannot reach whom, one example per strongly connected part."""
     ids, heard = scene.trains, robust_gain.graph(len(scene.trains), scene.links).tocsr()
-    parts, part = csgraph.connected_components(heard, connection="strong")
-    if parts == 1:
-        return []
     cut: list[str] = []
-    for k in range(parts):
-        if len(cut) > MOST:
-            break
-        i = int(np.flatnonzero(part == k)[0])
-        missed = np.setdiff1d(np.arange(len(ids)), csgraph.breadth_first_order(heard, i, return_predecessors=False))
-        if len(missed):
-            cut.append(f"what train {ids[i]} sends does not reach {_some([f'train {ids[m]}' for m in missed], ', ')}")
-    return [f"link: the graph must be strongly connected (Theorem 1): {_some(cut)}"]
+    _, part = csgraph.connected_components(heard, connection="strong")
+    for members in robust_gain.formations(scene):
+        parts, one_each = np.unique(part[members], return_index=True)
+        for i in members[one_each].tolist() if len(parts) > 1 else []:
+            missed = np.setdiff1d(members, csgraph.breadth_first_order(heard, i, return_predecessors=False))
+            if len(missed) and len(cut) <= MOST:
+                lost = _some([f"train {ids[m]}" for m in missed.tolist()], ", ")
+                cut.append(f"what train {ids[i]} sends does not reach {lost}")
+    return [f"link: the graph must be strongly connected (Theorem 1): {_some(cut)}"] if cut else []
 
 
 def _clamp_violations(scene: Scene) -> list[str]:
@@ -262,13 +267,30 @@ def warnings(params: Params, scene: Scene, tracks: Sequence[int] | None = None) 
 
 
 def report(params: Params, scene: Scene, amplitude: Floats, constant: Floats | None = None) -> robust_theory.Report:
-    """Theorem 1, the l1 bound and the steady state for this scene; arguments as of ``robust_theory.report``."""
-    return robust_theory.report(gains(params, len(scene.trains)), scene, amplitude, constant)
+    """Theorem 1, l1 bound and steady state of the largest formation; arguments as of ``robust_theory.report``."""
+    parts = robust_gain.formations(scene)
+    members = max(parts, key=len)
+    alone = robust_gain.restrict(scene, members)
+    steady = None if constant is None else constant[:, members]
+    found = robust_theory.report(gains(params, len(scene.trains))[members], alone, amplitude[:, members], steady)
+    if len(parts) > 1:
+        found.notes.append(f"{len(parts)} separate formations: the report is of trains {_some(alone.trains, ', ')}")
+    return found
 
 
-def worst_signs(params: Params, scene: Scene, plus: int, minus: int, steps: int) -> Floats:
-    """Signs of the worst disturbance for a pair of trains; see ``robust_gain.worst_signs``."""
-    return robust_gain.worst_signs(robust_gain.loop(gains(params, len(scene.trains)), scene), plus, minus, steps)
+def worst(params: Params, scene: Scene, plus: int, minus: int, steps: int) -> Floats:
+    """Signs (5, steps, n) of the disturbance that drives the error of trains ``plus`` and ``minus`` highest after ``steps`` steps.
+
+    See ``robust_gain.worst_signs``; both trains must be of one formation, the trains of others are left alone.
+    """
+    members = next(m for m in robust_gain.formations(scene) if plus in m)
+    if minus not in members:
+        raise InputError(f"disturbance.pair = {[scene.trains[plus], scene.trains[minus]]}: the two are not in one formation")
+    closed = robust_gain.loop(gains(params, len(scene.trains))[members], robust_gain.restrict(scene, members))
+    place = {i: k for k, i in enumerate(members.tolist())}
+    out = np.zeros((5, steps, len(scene.trains)))
+    out[:, :, members] = robust_gain.worst_signs(closed, place[plus], place[minus], steps)
+    return out
 
 
 def _speeds(scene: Scene) -> Floats:

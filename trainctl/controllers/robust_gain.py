@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import coo_array, csgraph
 
-from trainctl.signals import Floats, Links, Scene, leader_at
+from trainctl.signals import Floats, Ints, Links, Scene, leader_at
 
 #: Largest formation with a bound for every pair; beyond, only linked pairs and the ends have one.
 ALL_PAIRS = 12
@@ -73,6 +73,34 @@ def reference_speed(scene: Scene) -> float:
 def graph(n: int, links: Links) -> coo_array:
     """Who hears whom as a sparse matrix, sender to receiver."""
     return coo_array((np.ones(len(links.sender)), (links.sender, links.receiver)), shape=(n, n))
+
+
+def formations(scene: Scene) -> list[Ints]:
+    """Trains that links join in any direction, formation by formation: a train alone on its track is one of its own."""
+    count, part = csgraph.connected_components(graph(len(scene.trains), scene.links), connection="weak")
+    return [np.flatnonzero(part == k).astype(np.int64) for k in range(count)]
+
+
+def restrict(scene: Scene, members: Ints) -> Scene:
+    """Return the scene of one formation alone."""
+    new = np.full(len(scene.trains), -1)
+    new[members] = np.arange(len(members))
+    count = np.diff(scene.consists.first)
+    units = np.repeat(new, count) >= 0
+    first = np.concatenate(([0], np.cumsum(count[members])))
+    links, rows = scene.links, new[scene.links.receiver] >= 0
+    kept = {name: getattr(links, name)[rows] for name in ("desired", "lower", "upper", "weight", "heard")}
+    receiver = new[links.receiver[rows]]
+    return scene._replace(
+        trains=[scene.trains[i] for i in members.tolist()],
+        consists=type(scene.consists)(first, *(row[units] for row in scene.consists[1:])),
+        own=scene.own[units],
+        links=links._replace(
+            sender=new[links.sender[rows]], receiver=receiver, first=np.searchsorted(receiver, np.arange(len(members) + 1)),
+            slot=links.slot[members], order=new[links.order[new[links.order] >= 0]], **kept,
+        ),
+        bounds=type(scene.bounds)(*(row[members] for row in scene.bounds)),
+    )  # fmt: skip
 
 
 def potentials(n: int, links: Links) -> Floats:
