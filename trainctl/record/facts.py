@@ -24,12 +24,15 @@ class Facts:
 
     law: str = ""
     title: str = ""
+    observer: str = ""
+    controller: Mapping[str, Any] = field(default_factory=dict)  # its table
     trains: tuple[str, ...] = ()
     control_period_s: float = 0.0
     speed_mps: Mapping[str, Range] = field(default_factory=dict)
     input_mps2: Mapping[str, Range] = field(default_factory=dict)
     coupler_m: Range = UNBOUNDED
     mass_kg: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # of every unit
+    length_m: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     traction_n: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # limits of every unit, inf if none
     braking_n: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     reference: Reference | None = None
@@ -71,18 +74,25 @@ def facts_of(scenario: Mapping[str, Any]) -> Facts:
         row = np.broadcast_to(np.asarray(kind.get(key, missing), float), int(kind.get("units", 1)))
         return tuple(float(value) for value in row)
 
+    controller = scenario.get("controller", {})
+    # the finite-time law states its coupler range itself
+    own = (-float(controller.get("coupler_compression_m", math.inf)), float(controller.get("coupler_stretch_m", math.inf)))
+    stated = both("", "coupler_lower_m", "coupler_upper_m")
     masses = {name: per_unit(name, "unit_mass_kg", math.nan) for name in trains}
     timing, profile = scenario.get("run", {}), scenario.get("reference")
     start = max((float(train.get("position_m", 0.0)) for train in trains.values()), default=0.0)
     return Facts(
-        law=str(scenario.get("controller", {}).get("law", "")),
+        law=str(controller.get("law", "")),
+        observer=str(scenario.get("observer", {}).get("kind", "")),
+        controller=controller,
         title=str(scenario.get("title", "")),
         trains=tuple(trains),
         control_period_s=float(timing.get("control_period_s") or timing.get("step_s") or 0.0),
         speed_mps={name: both(name, "speed_lower_mps", "speed_upper_mps") for name in trains},
         input_mps2={name: both(name, "input_lower_mps2", "input_upper_mps2") for name in trains},
-        coupler_m=both("", "coupler_lower_m", "coupler_upper_m"),
+        coupler_m=(max(own[0], stated[0]), min(own[1], stated[1])),
         mass_kg={name: mass for name, mass in masses.items() if not math.isnan(sum(mass))},
+        length_m={name: per_unit(name, "unit_length_m", 0.0) for name in trains},
         traction_n={name: per_unit(name, "traction_n", math.inf) for name in trains},
         braking_n={name: per_unit(name, "braking_n", math.inf) for name in trains},
         reference=Profile.model_validate(profile).leader(start) if profile else None,
