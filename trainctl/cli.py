@@ -43,11 +43,9 @@ Settings = Annotated[
 
 
 def _scenario(name: str, settings: list[str] | None) -> Prepared:
-    from trainctl.prepare import prepare
-    from trainctl.scenario import load
+    from trainctl.prepare import open_scenario
 
-    scenario, path = load(name, dict(map(_setting, settings or [])))
-    return prepare(scenario, path.name, path.parent)
+    return open_scenario(name, dict(map(_setting, settings or [])))
 
 
 def _setting(text: str) -> tuple[str, Any]:

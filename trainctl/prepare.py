@@ -6,7 +6,8 @@ import importlib
 import importlib.metadata
 import math
 import pkgutil
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +21,7 @@ from sumo_net import Line, LineError
 from trainctl import controllers, observers
 from trainctl.errors import InputError
 from trainctl.plants import actuated_units, disturbance, point, shared
-from trainctl.scenario import Event, Scenario, mistakes
+from trainctl.scenario import Event, Scenario, examine, mistakes, read
 from trainctl.signals import FORCE, POSITION, SPEED, Bounds, Consists, Floats, Ints, Links, Reference, Scene, leader_at
 from trainctl.topology import graph
 
@@ -33,9 +34,6 @@ class Prepared:
 
     scenario: Scenario
     file: str
-    line: Line
-    spec: Any
-    net: Path | None
     law: Any
     params: Any
     plant: Any
@@ -47,6 +45,10 @@ class Prepared:
     bounds: Bounds
     reference: Reference
     plan: graph.Plan
+    first_links: Links
+    line: Any  # Line; None only while mistakes are still being gathered
+    spec: Any
+    net: Path | None
 
     @property
     def heads(self) -> Ints:
@@ -68,10 +70,6 @@ class Prepared:
         """Track of every train at the start, as index into ``line.track_ids``."""
         return np.array([self.line.track_ids.index(t.track) for t in self.scenario.train], np.int64)
 
-    def links(self, position: Floats, track: Ints) -> Links:
-        """Who hears whom with the trains there."""
-        return graph.links(self.plan, graph.order_on_tracks(position, track), track)
-
     def scene(self, own: Floats, links: Links, time: float) -> Scene:
         """What the law needs to check itself and to prepare its constants."""
         run = self.scenario.run
@@ -84,7 +82,7 @@ class Prepared:
     @cached_property
     def first_scene(self) -> Scene:
         """The scene at time 0."""
-        return self.scene(self.own, self.links(self.own[self.heads, POSITION], self.start_track), 0.0)
+        return self.scene(self.own, self.first_links, 0.0)
 
     def leader(self, t: float) -> Floats:
         """Position, speed, acceleration and jerk of the reference at ``t``, shape (4,)."""
@@ -122,7 +120,22 @@ def find_observer(name: str) -> Any:
     return _module(observers, name)
 
 
-def prepare(scenario: Scenario, file: str, folder: Path) -> Prepared:
+def open_scenario(name: str, overrides: dict[str, Any] | None = None) -> Prepared:
+    """Read, check and prepare a scenario by name or path.
+
+    Raises
+    ------
+    InputError
+        All mistakes that could be found, one line each.
+    """
+    data, path = read(name, overrides)
+    scenario, found = examine(data)
+    if scenario is None:
+        raise InputError([f"{path.name}: {line}" for line in found])
+    return prepare(scenario, path.name, path.parent, found)
+
+
+def prepare(scenario: Scenario, file: str, folder: Path, known: Sequence[str] = ()) -> Prepared:
     """Everything the loop needs, checked.
 
     Parameters
@@ -133,13 +146,15 @@ def prepare(scenario: Scenario, file: str, folder: Path) -> Prepared:
         Its name, for the mistakes.
     folder : Path
         Where relative paths in it start.
+    known : sequence of str
+        Mistakes found before; what is found here is told together with them.
 
     Raises
     ------
     InputError
         All mistakes that could be found, one line each.
     """
-    found: list[str] = []
+    found = list(known)
 
     def attempt(function: Any, *arguments: Any) -> Any:
         try:
@@ -160,24 +175,33 @@ def prepare(scenario: Scenario, file: str, folder: Path) -> Prepared:
     plan = attempt(_plan, scenario)
     if network is not None:
         found += _on_the_line(scenario, network[0])
-    if found or network is None:
+    if any(part is None for part in (law, params, observer, observer_params, plant_params, plan)):
         raise InputError([f"{file}: {line}" for line in found])
 
     consists = scenario.consists()
+    bounds = _bounds(scenario, consists)
     own = _initial(scenario, consists, getattr(plant, "STATES", 2))
-    first_slot = scenario.topology.first_slot_m
+    track = np.unique([t.track for t in scenario.train], return_inverse=True)[1].astype(np.int64)
+    start = own[0, POSITION] - scenario.topology.first_slot_m
+    reference = scenario.reference.leader(start)
+    first = graph.links(plan, graph.order_on_tracks(own[consists.first[:-1], POSITION], track), track)
     prepared = Prepared(
-        scenario=scenario, file=file, line=network[0], spec=network[1], net=network[2], law=law, params=params,
-        plant=plant, plant_params=plant_params, observer=observer, observer_params=observer_params,
-        consists=consists, own=own, bounds=_bounds(scenario, consists),
-        reference=scenario.reference.leader(own[0, POSITION] - first_slot), plan=plan,
+        scenario=_resolved(scenario, bounds), file=file, law=law, params=params, plant=plant, plant_params=plant_params,
+        observer=observer, observer_params=observer_params, consists=consists, own=own, bounds=bounds, reference=reference,
+        plan=plan, first_links=first, line=None, spec=None, net=None,
     )  # fmt: skip
-    found = _fits(prepared)
-    if not found:
-        scene = prepared.first_scene
-        found = [*_connected(prepared), *law.violations(params, scene), *observer.violations(observer_params, scene)]
+    unfit = _fits(prepared)
+    found += unfit or [
+        *_connected(prepared), *law.violations(params, prepared.first_scene), *observer.violations(observer_params, prepared.first_scene)
+    ]  # fmt: skip
+    if network is not None:
+        prepared = replace(prepared, line=network[0], spec=network[1], net=network[2])
+        found += _long_enough(prepared)
     if found:
-        raise InputError([f"{file}: {line}" for line in found])
+        # What follows from a key that is wrong already is not a mistake of its own.
+        wrong = [line.partition(" = ")[0].partition(":")[0].rpartition(".")[2] for line in known]
+        news = [line for line in found[len(known) :] if not any(f"{key} = " in line for key in wrong)]
+        raise InputError([f"{file}: {line}" for line in dict.fromkeys([*known, *news])])
     return prepared
 
 
@@ -334,6 +358,18 @@ def _bounds(scenario: Scenario, consists: Consists) -> Bounds:
     )
 
 
+def _resolved(scenario: Scenario, bounds: Bounds) -> Scenario:
+    """The scenario with the input bounds that follow from the units written down, for the metrics and whoever reads the log."""
+    if not np.all(np.isfinite(bounds.input_lower) & np.isfinite(bounds.input_upper)):
+        return scenario
+    low, high = bounds.input_lower.tolist(), bounds.input_upper.tolist()
+    if len(set(low)) == len(set(high)) == 1:
+        table = scenario.bounds.model_copy(update={"input_lower_mps2": low[0], "input_upper_mps2": high[0]})
+        return scenario.model_copy(update={"bounds": table})
+    own = [t.model_copy(update={"input_lower_mps2": a, "input_upper_mps2": b}) for t, a, b in zip(scenario.train, low, high, strict=True)]
+    return scenario.model_copy(update={"train": tuple(own)})
+
+
 def _fits(p: Prepared) -> list[str]:
     """Law, plant and observer that do not go together, bounds no train can keep, a line that is too short."""
     found = []
@@ -343,14 +379,7 @@ def _fits(p: Prepared) -> list[str]:
     known = getattr(p.law, "OBSERVERS", ("none",))
     if p.scenario.observer.kind not in known:
         found.append(f"observer.kind = {p.scenario.observer.kind}: law {p.scenario.controller.law} works with {', '.join(known)}")
-    end = p.scenario.run.duration_s
-    travel = p.leader(end)[0] - p.leader(0.0)[0]
     for i, t in enumerate(p.scenario.train):
-        if t.position_m + travel > p.line.end_m:
-            found.append(
-                f"run.duration_s = {end:g}: at the reference speed train {t.id} reaches {t.position_m + travel:.0f} m, beyond the line's"
-                f" end at {p.line.end_m:.10g} m"
-            )
         for key, low, high in (("speed", p.bounds.speed_lower[i], p.bounds.speed_upper[i]), ("input", p.bounds.input_lower[i], p.bounds.input_upper[i])):
             if not low < high:
                 found.append(f"train[{t.id}]: {key} bounds {low:g} .. {high:g} are empty")
@@ -363,6 +392,18 @@ def _fits(p: Prepared) -> list[str]:
             if p.bounds.input_upper[i] > greatest[i] + 1e-12:
                 found.append(f"train[{t.id}].input_upper_mps2 = {p.bounds.input_upper[i]:g}: its units can give {greatest[i]:.6g} m/s2 at most at the upper speed bound")
     return found
+
+
+def _long_enough(p: Prepared) -> list[str]:
+    """Trains that would run off the line's end at the reference speed."""
+    end = p.scenario.run.duration_s
+    travel = p.leader(end)[0] - p.leader(0.0)[0]
+    return [
+        f"run.duration_s = {end:g}: at the reference speed train {t.id} reaches {t.position_m + travel:.0f} m, beyond the line's end at"
+        f" {p.line.end_m:.10g} m"
+        for t in p.scenario.train
+        if t.position_m <= p.line.end_m < t.position_m + travel
+    ]
 
 
 def _messages_fit(p: Prepared) -> list[str]:

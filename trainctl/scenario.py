@@ -415,16 +415,64 @@ def load(name: str, overrides: dict[str, Any] | None = None) -> tuple[Scenario, 
     InputError
         With one line per mistake.
     """
+    data, path = read(name, overrides)
+    scenario, found = examine(data)
+    if scenario is None or found:
+        raise InputError([f"{path.name}: {line}" for line in found])
+    return scenario, path
+
+
+def read(name: str, overrides: dict[str, Any] | None = None) -> tuple[dict[str, Any], Path]:
+    """The tables of a scenario as they stand, and its file."""
     path = find(name)
+    data = _read(path)
+    for key, value in (overrides or {}).items():
+        _set(data, key, value)
+    return data, path
+
+
+def _read(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """The tables of a file, laid over those of the scenario it extends."""
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path.name}: not a TOML file: {error}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    for key, value in (overrides or {}).items():
-        _set(data, key, value)
-    return parse(data, path.name), path
+    base = data.pop("extends", None)
+    if base is None:
+        return data
+    try:
+        beside = path.parent / str(base)
+        under = beside if beside.is_file() else find(str(base))
+    except InputError as error:
+        raise InputError([f"{path.name}: extends = {m}" for m in error.mistakes]) from None
+    if under.resolve() in above:
+        raise InputError(f"{path.name}: extends = {base}: comes back to itself")
+    return _over(_read(under, (*above, path.resolve())), data)
+
+
+def _over(base: dict[str, Any], data: dict[str, Any]) -> dict[str, Any]:
+    """``data`` over ``base``: tables key by key, trains by id, everything else replaced."""
+    merged = dict(base)
+    for key, value in data.items():
+        old = base.get(key)
+        if isinstance(old, dict) and isinstance(value, dict):
+            # Another law, plant or observer brings its own keys; the old one's would be unknown to it.
+            other = any(k in value and k in old and value[k] != old[k] for k in ("law", "kind"))
+            merged[key] = value if other else _over(old, value)
+        elif key == "train" and isinstance(old, list) and isinstance(value, list):
+            merged[key] = _trains_over(old, value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def _trains_over(base: list[Any], trains: list[Any]) -> list[Any]:
+    news = {str(t.get("id")): t for t in trains if isinstance(t, dict)}
+    known = {str(t.get("id")) for t in base if isinstance(t, dict)}
+    changed = [{**t, **news.get(str(t.get("id")), {})} if isinstance(t, dict) else t for t in base]
+    return [*changed, *(t for t in trains if not isinstance(t, dict) or str(t.get("id")) not in known)]
 
 
 def _set(data: dict[str, Any], key: str, value: Any) -> None:
@@ -437,17 +485,48 @@ def _set(data: dict[str, Any], key: str, value: Any) -> None:
     table[last] = value
 
 
-def parse(data: dict[str, Any], file: str) -> Scenario:
-    """Validate the tables of a scenario; ``file`` names it in the mistakes."""
-    try:
-        # JSON has the same types as TOML but for dates, and lets arrays stand for tuples under strict rules.
-        scenario = Scenario.model_validate_json(json.dumps(data, default=str))
-    except ValidationError as error:
-        raise InputError([f"{file}: {line}" for line in mistakes(error, data)]) from None
-    found = scenario.cross_references()
-    if found:
-        raise InputError([f"{file}: {line}" for line in found])
-    return scenario
+def examine(data: dict[str, Any]) -> tuple[Scenario | None, list[str]]:
+    """A scenario and all mistakes in its file.
+
+    With mistakes, the scenario is what remains without the keys that are wrong, so that the others can still be checked; None if
+    too little remains.
+    """
+    found: list[str] = []
+    rest = data
+    for _ in range(3):
+        try:
+            # JSON has the same types as TOML but for dates, and lets arrays stand for tuples under strict rules.
+            scenario = Scenario.model_validate_json(json.dumps(rest, default=str))
+        except ValidationError as error:
+            found += [line for line in mistakes(error, rest) if not (rest is not data and line.endswith(": missing"))]
+            rest = _without(rest, [e["loc"] for e in error.errors() if e["type"] != "missing"])
+            if isinstance(rest.get("run"), dict):
+                rest["run"].setdefault("duration_s", rest["run"].get("step_s", 1.0))  # nothing else is checked against it
+        else:
+            wrong = scenario.cross_references()
+            return (None if wrong else scenario), list(dict.fromkeys([*found, *wrong]))
+    return None, list(dict.fromkeys(found))
+
+
+def _without(data: Any, places: list[tuple[int | str, ...]]) -> Any:
+    """A copy without the values at these places; places inside a union are cut where the data end."""
+    doomed = [p for p in places if p]
+    if isinstance(data, dict):
+        kept = {k: v for k, v in data.items() if not any(p[0] == k and not _inside(v, p[1:]) for p in doomed)}
+        return {k: _without(v, [p[1:] for p in doomed if p[0] == k]) for k, v in kept.items()}
+    if isinstance(data, list):
+        kept_items = [(k, v) for k, v in enumerate(data) if not any(p[0] == k and not _inside(v, p[1:]) for p in doomed)]
+        return [_without(v, [p[1:] for p in doomed if p[0] == k]) for k, v in kept_items]
+    return data
+
+
+def _inside(value: Any, place: tuple[int | str, ...]) -> bool:
+    """Whether the rest of a place leads further into the value."""
+    if not place:
+        return False
+    if isinstance(value, dict):
+        return place[0] in value
+    return isinstance(value, list) and isinstance(place[0], int) and place[0] < len(value)
 
 
 def mistakes(error: ValidationError, data: dict[str, Any], under: str = "") -> list[str]:

@@ -1,0 +1,30 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import settings
+
+settings.register_profile("suite", derandomize=True, deadline=None)
+settings.load_profile("suite")
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
+    """Run a scenario once per session and hand out its run folder: finished("three_tracks", "numeric", **{"run.duration_s": 60})."""
+    from trainctl.prepare import open_scenario
+    from trainctl.record.run import Run
+    from trainctl.runner import run
+
+    done: dict[Any, Run] = {}
+
+    def finish(name: str, backend: str = "sumo", **overrides: Any) -> Run:
+        key = (name, backend, repr(sorted(overrides.items())))
+        if key not in done:
+            folder: Path = tmp_path_factory.mktemp("runs") / Path(name).stem
+            done[key] = run(open_scenario(name, overrides), folder, backend)  # type: ignore[arg-type]
+        return done[key]
+
+    return finish
