@@ -151,7 +151,7 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
     eta, Eta = _input_room(constants, own, v_r)
     delta = np.maximum(alpha, np.maximum(beta, eta))
     Delta = np.minimum(Alpha, np.minimum(Beta, Eta))
-    sat = np.where(G >= Delta, Delta, np.maximum(G, delta))
+    sat = np.where(Delta <= G, Delta, np.maximum(G, delta))
     s = np.where(hold, 0.0, sat)
     return Demand(acceleration=(v_r + s / T - v) / T, saturated=(s != G) & ~hold)
 
@@ -236,7 +236,7 @@ def _input_violations(scene: Scene, slow: float, fast: float) -> Iterator[str]:
     rho, Rho, mu, Mu = scene.bounds
     T = scene.control_period
     f, F = _resistance_range(_train_davis(scene.consists), rho, Rho)
-    brakes, pulls = mu < f, F < Mu
+    brakes, pulls = mu < f, Mu > F
     cure = ""
     if brakes.all() and pulls.all():
         period = max(np.max((Rho - slow) / (f - mu)), np.max((fast - rho) / (Mu - F)))
@@ -295,12 +295,13 @@ def _link_violations(scene: Scene) -> Iterator[str]:
     """Assumption 2.2, and trains that have a length."""
     links = scene.links
     rows = {(j, i): row for row, (j, i) in enumerate(zip(links.sender.tolist(), links.receiver.tolist(), strict=True))}
-    length = scene.consists.train_length()
+    length, mutual = scene.consists.train_length(), True
     for row in _pairs(scene):
         j, i = int(links.sender[row]), int(links.receiver[row])
         name, d, lower, upper = _name(scene, row), links.desired[row], links.lower[row], links.upper[row]
         back = rows.get((i, j))
         if back is None:
+            mutual = False
             yield f"{name}: train {scene.trains[j]} must hear train {scene.trains[i]} too, this law needs links both ways"
         elif not np.allclose((d, lower, upper), (-links.desired[back], -links.upper[back], -links.lower[back]), 0.0, ROUNDING):
             yield f"{name}: desired_m, lower_m and upper_m must be the same both ways with the sign changed (Assumption 2.2)"
@@ -310,13 +311,14 @@ def _link_violations(scene: Scene) -> Iterator[str]:
             yield f"{name}.lower_m = {lower:.10g}: must be below desired_m = {d:.10g} (Assumption 2.2)"
         if not d < upper:
             yield f"{name}.upper_m = {upper:.10g}: must be above desired_m = {d:.10g} (Assumption 2.2)"
-        if 0.0 < d and lower < length[j] and length[j] > 0.0:
+        if d > 0.0 and lower < length[j] and length[j] > 0.0:
             yield f"{name}.lower_m = {lower:.10g}: spacing is front to front, and train {scene.trains[j]} is {length[j]:.10g} m"
-    yield from _cycle_violations(scene)
+    if mutual:
+        yield from _cycle_violations(scene)
 
 
 def _cycle_violations(scene: Scene) -> Iterator[str]:
-    """Assumption 2.2 on every cycle: a spanning forest gives the offsets, each link outside it closes one cycle."""
+    """Assumption 2.2 on every cycle of links both ways: a spanning forest gives offsets, each link outside it closes a cycle."""
     links, n = scene.links, len(scene.trains)
     offset, parent, depth = np.full(n, np.nan), np.full(n, -1), np.zeros(n, dtype=int)
     for root in range(n):
