@@ -24,7 +24,7 @@ from typing import Annotated, Literal, NamedTuple, get_args
 
 import numpy as np
 from numba import njit
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from pydantic.json_schema import SkipJsonSchema
 from pydantic_core import PydanticCustomError
 
@@ -72,11 +72,7 @@ def _no_unit(value: object) -> float:
     )
 
 
-def _name(value: int | str) -> str:
-    return str(value)
-
-
-Id = Annotated[str, BeforeValidator(_name, json_schema_input_type=int | str)]
+Id = Annotated[int | str, AfterValidator(str)]
 PerTrain = float | tuple[float, ...]
 WithoutUnit = SkipJsonSchema[Annotated[float | None, BeforeValidator(_no_unit)]]
 
@@ -135,7 +131,7 @@ class Disturbance(Table):
     @property
     def trains(self) -> tuple[str, ...]:
         """Trains named; ("all",) for all."""
-        return (self.train,) if isinstance(self.train, str) else self.train
+        return tuple(str(t) for t in self.train) if isinstance(self.train, tuple) else (str(self.train),)
 
     @model_validator(mode="after")
     def _keys_of_this_shape(self) -> Disturbance:
@@ -225,7 +221,7 @@ def violations(entries: Sequence[Disturbance], trains: Sequence[str], seed: int 
             if name not in trains and entry.trains != ("all",):
                 found.append(f"{here}.train = {name}: no such train; there are: {', '.join(trains)}")
         for name in entry.pair or ():
-            if name not in trains:
+            if str(name) not in trains:
                 found.append(f"{here}.pair = {name}: no such train; there are: {', '.join(trains)}")
         for key in (entry.amplitude_key, entry.std_key):
             value = getattr(entry, key)
@@ -272,7 +268,7 @@ def prepare(
         stream = entry.channel + len(CHANNELS) * (ordinal if entry.seed is None else 0)
         begin, signs = round((entry.from_s or 0.0) / step), None
         if entry.pair is not None and entry.peak_s is not None and worst is not None:
-            signs = worst(index[entry.pair[0]], index[entry.pair[1]], max(1, round(entry.peak_s / step)))
+            signs = worst(index[str(entry.pair[0])], index[str(entry.pair[1])], max(1, round(entry.peak_s / step)))
             begin = 0
         for name, a, s in zip(named, amplitude, std, strict=True):
             column = np.asarray(entry.values or (), float) if signs is None else signs[entry.channel, :, index[name]]
