@@ -78,6 +78,11 @@ def width(params: Params) -> int:
     return WIDTH
 
 
+def tolerated_speed_offset(params: Params, scene: Scene) -> float:
+    """Largest start error of the speed estimates that is let through [m/s]: measured on the paper's start with the default gains."""
+    return 10.0
+
+
 def violations(params: Params, scene: Scene) -> list[str]:
     """Every reason for which the estimator cannot work here."""
     found = []
@@ -86,6 +91,10 @@ def violations(params: Params, scene: Scene) -> list[str]:
         found.append(
             f"observer.kappa_per_s = {params.kappa_per_s:g}: too fast for a sub-step of {scene.sub_step:g} s, "
             f"{stiff:g} = (kappa + r) h must not exceed 2.5"
+        )
+    if abs(params.start_offset_speed_mps) > (most := tolerated_speed_offset(params, scene)):
+        found.append(
+            f"observer.start_offset_speed_mps = {params.start_offset_speed_mps:g}: the start may be wrong by at most {most:g} m/s"
         )
     return found
 

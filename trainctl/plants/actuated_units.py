@@ -74,7 +74,7 @@ class Constants(NamedTuple):
     """The plant's constants. Columns ``PUSH`` and ``NOISE`` of ``units`` may be overwritten in place between steps."""
 
     first: Ints  # (n + 1,)
-    units: Floats  # (U, 15) as in coupled_units, then RATE, NOISE
+    units: Floats  # as in coupled_units, then RATE, NOISE
     gradient: Floats  # (G, 2) as in coupled_units
     faults: Faults
 
