@@ -48,7 +48,7 @@ class Constants(NamedTuple):
     """What the units believe of themselves, and the acceleration they hold."""
 
     first: Ints  # (n + 1,)
-    units: Floats  # (U, 13) as in coupled_units
+    units: Floats  # (U, 14) as in coupled_units
     gradient: Floats  # (G, 2)
     acceleration: Floats  # (n,) m/s2, overwritten once per control period
     stiffness: float  # 1/s2
@@ -84,7 +84,7 @@ def demand(
         if len(gradient) > 0:
             load += GRAVITY * slope_at(own[j, POSITION], gradient)
         base, extra = units[row, INERTIA] * a_i + m * load, pull - f
-        out[j] = base
+        out[j] = base + extra
         if extra > 0.0:
             room = available(v, units[row, TRACTION], units[row, TRACTION_POWER]) - base
         else:
@@ -92,11 +92,11 @@ def demand(
         if abs(extra) > room:
             scale = min(scale, max(room, 0.0) / abs(extra))
         pull = f
-    if scale > 0.0:
+    if scale < 1.0:
         for j in range(last):
-            f = scale * pair(constants, start + j, own, j)
-            out[j] -= f
-            out[j + 1] += f
+            f = (1.0 - scale) * pair(constants, start + j, own, j)
+            out[j] += f
+            out[j + 1] -= f
 
 
 @njit(cache=True, inline="always")
