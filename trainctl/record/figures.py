@@ -99,7 +99,7 @@ def _has(drawn: Drawn, name: str) -> bool:
 
 
 def figure(run: Run, name: str, width: str = "double") -> Figure:
-    """One figure of a run by its plain name.
+    """One figure of a run by its plain name, see ``FIGURES``.
 
     Parameters
     ----------

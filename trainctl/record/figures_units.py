@@ -22,6 +22,7 @@ def couplers(drawn: Drawn) -> Figure:
     _bands(axes[0], drawn, drawn.units.column("coupler_m"), low, high, "coupler ")
     style.bound(axes[0], *drawn.known.coupler_m)
     axes[0].set_ylabel("coupler displacement [m]")
+    style.room(axes[0], 1e-3)
     return _finished(figure, axes, drawn)
 
 
@@ -31,6 +32,7 @@ def coupler_forces(drawn: Drawn) -> Figure:
     force = drawn.units.column("coupler_force_n") / 1000
     _bands(axes[0], drawn, force, force, force, "coupler ")
     axes[0].set_ylabel("coupler force [kN]")
+    style.room(axes[0], 0.1)
     return _finished(figure, axes, drawn)
 
 

@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from trainctl.signals import Floats
 
@@ -29,6 +28,9 @@ WIDTHS_MM = {"single": 85.0, "double": 178.0}
 POINTS = 2000
 #: More lines than this are coloured by a scale, and only some of them named.
 NAMED = len(COLOURS)
+
+#: Resolution of bitmaps [1/inch].
+DPI = 300
 
 SETTINGS = {
     "font.size": 8.0, "axes.labelsize": 8.0, "axes.titlesize": 8.0, "legend.fontsize": 7.0, "xtick.labelsize": 7.0,
@@ -63,7 +65,8 @@ def legend(figure: Figure, width: str, handles: Sequence[Any] | None = None) -> 
     if not handles:
         return
     longest = max(len(str(handle.get_label())) for handle in handles)
-    columns = int(np.clip((50 if width == "single" else 110) // (longest + 5), 1, len(handles)))
+    points = WIDTHS_MM[width] / 25.4 * 72  # of the whole width; an entry takes about 26 and 3.9 per letter
+    columns = int(np.clip(0.95 * points // (3.9 * longest + 26), 1, len(handles)))
     figure.legend(
         handles=handles, loc="outside upper center", ncols=columns, frameon=False, handlelength=1.8, columnspacing=1.2,
     )  # fmt: skip
@@ -79,7 +82,7 @@ def _order(handle: Any) -> list[tuple[int, int, str]]:
 
 def weights(count: int) -> list[float]:
     """Line widths, the first ones wide: where lines lie on each other, the wide ones show behind the thin ones."""
-    return list(np.linspace(2.4, 0.8, count)) if 1 < count <= NAMED else [0.8] * count
+    return list(np.linspace(2.0, 0.8, count)) if 1 < count <= NAMED else [0.8] * count
 
 
 def colours(count: int) -> list[Any]:
@@ -137,9 +140,12 @@ def bound(axes: Axes, *values: float, label: str = "bound", **options: Any) -> N
             axes.axhline(value, **{"color": GREY, "linestyle": (0, (5, 2)), "linewidth": 0.9, "label": label} | options)
 
 
-def bound_handle(label: str = "bound") -> Line2D:
-    """Legend entry of a bound."""
-    return Line2D([], [], color=GREY, linestyle=(0, (5, 2)), linewidth=0.9, label=label)
+def room(axes: Axes, least: float) -> None:
+    """Let the vertical axis span at least ``least``, so that rounding does not look like something."""
+    low, high = axes.get_ylim()
+    if high - low < least:
+        middle = 0.5 * (low + high)
+        axes.set_ylim(middle - 0.5 * least, middle + 0.5 * least)
 
 
 def save(figure: Figure, path: Path, formats: Sequence[str]) -> list[Path]:
@@ -149,6 +155,6 @@ def save(figure: Figure, path: Path, formats: Sequence[str]) -> list[Path]:
     for kind in formats:
         target = path.with_name(f"{path.name}.{kind}")
         with styled():
-            figure.savefig(target, dpi=300, metadata=undated.get(kind))
+            figure.savefig(target, dpi=DPI, metadata=undated.get(kind))
         written.append(target)
     return written
