@@ -135,7 +135,9 @@ class _progress:
 def _summary(done: Run, prepared: Prepared) -> None:
     """Where the results lie, and whether the bounds held."""
     info, metrics = done.info, done.metrics
-    table = _table(f"{prepared.scenario.title}", "", "")
+    print(prepared.scenario.title)
+    table = _table(None, "", "")
+    table.show_header = False
     law = prepared.scenario.controller.law
     table.add_row("law, plant", f"{law} on {prepared.scenario.plant.kind}, {len(prepared.scenario.train)} trains, backend {info['backend']}")
     table.add_row("steps", f"{info['steps']} of {prepared.scenario.run.step_s:g} s in {info['wall_time_s']:.1f} s")
@@ -187,7 +189,9 @@ def check(name: ScenarioName = DEFAULT_SCENARIO, settings: Settings = None, as_j
     if as_json:
         _print_json(found)
         return
-    table = _table(f"{prepared.file}: no mistakes; every assumption of {prepared.scenario.controller.law} holds", "", "")
+    print(f"{prepared.file}: no mistakes; every assumption of {prepared.scenario.controller.law} holds")
+    table = _table(None, "", "")
+    table.show_header = False
     for key, value in found.items():
         if key not in ("warnings", "report"):
             table.add_row(key, str(value))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import json
 import math
 import pkgutil
 from collections.abc import Sequence
@@ -206,14 +207,10 @@ def prepare(scenario: Scenario, file: str, folder: Path, known: Sequence[str] = 
 
 
 def _params(model: Any, keys: dict[str, Any], table: str) -> Any:
-    import json
-
     try:
         return model.model_validate_json(json.dumps(keys))
     except ValidationError as error:
-        lines = mistakes(error, keys, table)
-        known = ", ".join(model.model_fields) or "none"
-        raise InputError([f"{m}; known: {known}" if m.endswith("unknown key") else m for m in lines]) from None
+        raise InputError(mistakes(error, keys, table, model)) from None
 
 
 def _network(scenario: Scenario, folder: Path) -> tuple[Line, Any, Path | None]:

@@ -21,7 +21,7 @@ from pydantic import AfterValidator, Field, ValidationError, field_validator, mo
 from trainctl.errors import InputError
 from trainctl.plants.disturbance import Disturbance
 from trainctl.plants.faults import Fault
-from trainctl.reference import Profile
+from trainctl.reference import FORMS, Profile
 from trainctl.signals import Bounds, Consists, Table
 
 SCHEMA_VERSION = 1
@@ -452,6 +452,10 @@ def _read(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
     return _over(_read(under, (*above, path.resolve())), data)
 
 
+#: Keys that exclude each other: who states one of them drops the extended file's.
+EXCLUSIVE = {"network": ("line", "net"), "reference": FORMS}
+
+
 def _over(base: dict[str, Any], data: dict[str, Any]) -> dict[str, Any]:
     """``data`` over ``base``: tables key by key, trains by id, everything else replaced."""
     merged = dict(base)
@@ -460,7 +464,8 @@ def _over(base: dict[str, Any], data: dict[str, Any]) -> dict[str, Any]:
         if isinstance(old, dict) and isinstance(value, dict):
             # Another law, plant or observer brings its own keys; the old one's would be unknown to it.
             other = any(k in value and k in old and value[k] != old[k] for k in ("law", "kind"))
-            merged[key] = value if other else _over(old, value)
+            stated = [k for k in EXCLUSIVE.get(key, ()) if k in value]
+            merged[key] = value if other else _over({k: v for k, v in old.items() if not stated or k not in EXCLUSIVE[key]}, value)
         elif key == "train" and isinstance(old, list) and isinstance(value, list):
             merged[key] = _trains_over(old, value)
         else:
@@ -529,7 +534,7 @@ def _inside(value: Any, place: tuple[int | str, ...]) -> bool:
     return isinstance(value, list) and isinstance(place[0], int) and place[0] < len(value)
 
 
-def mistakes(error: ValidationError, data: dict[str, Any], under: str = "") -> list[str]:
+def mistakes(error: ValidationError, data: dict[str, Any], under: str = "", model: Any = Scenario) -> list[str]:
     """One line per mistake pydantic found: ``key = value: rule``."""
     lines = []
     for e in error.errors(include_url=False):
@@ -538,7 +543,7 @@ def mistakes(error: ValidationError, data: dict[str, Any], under: str = "") -> l
         key = f"{under}.{key}" if under and key else under or key
         value = e["input"]
         if e["type"] == "extra_forbidden":
-            known = _known(loc)
+            known = _known(loc, model)
             near = difflib.get_close_matches(str(loc[-1]), known, n=1)
             rule = "unknown key" + (f"; did you mean {near[0]}?" if near else "") + (f"; known: {', '.join(known)}" if known else "")
             lines.append(f"{key}: {rule}")
@@ -573,17 +578,11 @@ def _key(loc: list[Any], data: Any) -> str:
     return text
 
 
-def _known(loc: list[Any]) -> list[str]:
-    """Keys the table at ``loc[:-1]`` has, for tables whose model stands in ``Scenario``."""
-    model: Any = Scenario
+def _known(loc: list[Any], model: Any) -> list[str]:
+    """Keys the table at ``loc[:-1]`` of ``model`` has."""
     for part in loc[:-1]:
-        if isinstance(part, int):
-            continue
         field = getattr(model, "model_fields", {}).get(part)
-        if field is None:
-            return list(TrainType.model_fields) if model is Scenario or loc[0] == "train_type" else []
-        model = field.annotation
-        for inner in getattr(model, "__args__", ()):
-            if hasattr(inner, "model_fields"):
-                model = inner
+        if field is not None:
+            inner = [a for a in getattr(field.annotation, "__args__", ()) if hasattr(a, "model_fields")]
+            model = inner[0] if inner else field.annotation
     return list(getattr(model, "model_fields", {}))

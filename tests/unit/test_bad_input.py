@@ -1,0 +1,164 @@
+"""Every mistake a user can make in a scenario: one line each, all at once, exit code 2, nothing left on disk."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from trainctl import cli
+
+PAPER = 'extends = "fully_distributed"\n'
+TWO_TRAINS = """
+schema_version = 1
+title = "t"
+[run]
+duration_s = 10
+[network]
+line = "three_tracks"
+[controller]
+law = "fully_distributed"
+[reference]
+speed_mps = 80.0
+[bounds]
+speed_lower_mps = 75.0
+speed_upper_mps = 85.0
+input_lower_mps2 = -11.0
+input_upper_mps2 = 11.0
+[train_type.point]
+unit_mass_kg = 1.0
+c0_n_per_kg = 0.01
+c1_ns_per_m_kg = 0.0
+c2_ns2_per_m2_kg = 0.0
+"""
+
+
+def train(number, position, speed=80.0):
+    return f'[[train]]\nid = {number}\ntype = "point"\ntrack = 1\nposition_m = {position}\nspeed_mps = {speed}\n'
+
+
+@pytest.fixture
+def typed(tmp_path, monkeypatch, capsys):
+    """Type a command: exit code and the lines on stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["trainctl", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        return stop.value.code, capsys.readouterr().err.splitlines()
+
+    return call
+
+
+CASES = {
+    "unknown key": (PAPER + "[run]\ndt = 1\n", ["run.dt: unknown key; known: duration_s"]),
+    "unknown key of the law": (PAPER + "[controller]\nkv = 1.0\n", ["controller.kv: unknown key; known: eta, join"]),
+    "near miss": (PAPER + "[run]\nduraton_s = 1\n", ["run.duraton_s: unknown key; did you mean duration_s?"]),
+    "wrong type": (PAPER + '[bounds]\nspeed_upper_mps = "85"\n', ["bounds.speed_upper_mps = 85: input should be a valid number"]),
+    "wrong unit": (PAPER + "[[train]]\nid = 1\nspeed_kmh = 288\n", ["train[1].speed_kmh: unknown key"]),
+    "below a bound": (PAPER + "[[train]]\nid = 2\nspeed_mps = 91.0\n", ["train[2].speed_mps = 91: above speed_upper_mps = 85"]),
+    "outside (13)": (PAPER + "[[train]]\nid = 2\nposition_m = 23950.0\n", ["spacing at the start is 50 m", "eq. (13), is 53 m"]),
+    "graph not connected": (
+        TWO_TRAINS + "[topology]\nrule = 'links'\nspacing_m = 5000.0\n" + train(1, 9000) + train(2, 4000) + train(3, 500)
+        + "[[link]]\nbetween = [1, 2]\n",
+        ["topology: the graph of the [[link]] tables is not connected: 1, 2 | 3"],
+    ),
+    "cycle": (
+        TWO_TRAINS + "[topology]\nspacing_m = 5000.0\n" + train(1, 11000) + train(2, 6000) + train(3, 500)
+        + "[[link]]\nbetween = [1, 3]\ndesired_m = 11000.0\nextra = true\n",
+        ["around the cycle 3-2-1-3 sum to -1000 m, must be 0"],
+    ),
+    "off the line": (PAPER + "[[train]]\nid = 1\nposition_m = 480001.0\n", ["train[1].position_m = 480001: off the line"]),
+    "overlap": (
+        'extends = "three_tracks"\n[[train]]\nid = 2\nposition_m = 24100.0\n',
+        ["train[2].position_m = 24100: overlaps train 1 on track 1, whose rear is at 24080 m"],
+    ),
+    "no such crossover": (
+        PAPER + '[[event]]\nkind = "reroute"\ntrain = 2\ncrossover = "nowhere"\n',
+        ["event[1].crossover = nowhere: no such crossover; next on track 1:"],
+    ),
+    "crossover of another track": (
+        PAPER + '[[event]]\nkind = "reroute"\ntrain = 5\ncrossover = "leave"\n',
+        ["event[1].crossover = leave: leaves track 1, train 5 is on track 2"],
+    ),
+    "switch certainly passed": (
+        PAPER + '[[event]]\nkind = "reroute"\ntrain = 2\ncrossover = "leave"\ntime_s = 1100\n',
+        ["event[1].crossover = leave: its switch at 99945 m has been passed"],
+    ),
+    "switch passed when the time comes": (
+        PAPER + '[[event]]\nkind = "reroute"\ntrain = 2\ncrossover = "leave"\ntime_s = 1010\n',
+        ["event[1]: crossover leave: its switch at 99945 m lies behind", "train 2 is at 1007"],
+    ),
+    "missing net": (PAPER + '[network]\nline = 1\n', ["network.line = 1: input should be a valid string"]),
+    "no such line": (PAPER + '[network]\nline = "four"\n', ["network.line = four: no such line; known: single_track, three_tracks"]),
+    "no such law": (PAPER + '[controller]\nlaw = "magic"\n', ["controller.law = magic: no such law; known:"]),
+    "loss without seed": (PAPER + "[topology]\nloss = 0.1\n", ["topology.loss = 0.1: losses are random, so the run needs [run] seed"]),
+    "units of the wrong number": (
+        'extends = "three_tracks"\n[train_type.emu]\nunit_mass_kg = [1.0, 2.0]\n',
+        ["train_type.emu: unit_mass_kg has 2 values: units = 4"],
+    ),
+    "mass not positive": (
+        'extends = "three_tracks"\n[train_type.emu]\nunit_mass_kg = -5.0\n', ["train_type.emu: unit_mass_kg = -5: must be above 0"],
+    ),
+    "control period too short": (
+        'extends = "three_tracks"\n[run]\ncontrol_period_s = 6.0\n', ["run.control_period_s above 6.26537"],
+    ),
+    "lower bound inside a train": (
+        'extends = "three_tracks"\n[topology]\nlower_m = 100.0\n', ["spacing is front to front, and train 1 is 320 m"],
+    ),
+    "line too short": (PAPER + "[run]\nduration_s = 6000\n", ["run.duration_s = 6000: at the reference speed train 1 reaches 504000 m"]),
+    "not TOML": ("a = = 3", ["not a TOML file"]),
+    "extends itself": ('extends = "mistaken.toml"\n', ["comes back to itself"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_each_mistake_is_told_in_words(case, typed, tmp_path):
+    text, expected = CASES[case]
+    (tmp_path / "mistaken.toml").write_text(text)
+    code, lines = typed("run", "mistaken.toml", "--backend", "numeric")
+    assert code == 2
+    assert all(line.startswith("mistaken.toml: ") for line in lines)
+    for part in expected:
+        assert any(part in line for line in lines), lines
+    assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) == ["mistaken.toml"]
+
+
+def test_all_mistakes_come_at_once(typed, tmp_path):
+    text = PAPER + (
+        '[run]\nduration_s = "long"\ndt = 3\n[bounds]\nspeed_upper_mps = "85"\n[[train]]\nid = 3\nposition_m = -5.0\n'
+        '[[event]]\nkind = "reroute"\ntrain = 2\ncrossover = "nowhere"\n'
+    )
+    (tmp_path / "mistaken.toml").write_text(text)
+    code, lines = typed("check", "mistaken.toml")
+    assert code == 2
+    for key in ("run.duration_s = long", "run.dt:", "bounds.speed_upper_mps = 85", "train[3].position_m = -5", "event[1].crossover"):
+        assert sum(f"mistaken.toml: {key}" in line for line in lines) == 1, lines
+    assert not any("speed_upper_mps = inf" in line for line in lines), "what follows from a mistake is not another one"
+
+
+def test_a_net_that_is_missing_or_not_rail(typed, tmp_path):
+    (tmp_path / "road.net.xml").write_text('<net><edge id="e"><lane id="e_0" speed="1" length="1" shape="0,0 1,0"/></edge></net>')
+    for name, words in (("gone.net.xml", "no such net file"), ("road.net.xml", "has no rail edges")):
+        (tmp_path / "mistaken.toml").write_text(f'{PAPER}[network]\nnet = "{name}"\n')
+        code, lines = typed("check", "mistaken.toml")
+        assert code == 2
+        assert any(words in line for line in lines), lines
+
+
+def test_a_folder_that_is_not_ours_is_not_touched(typed, tmp_path):
+    other = tmp_path / "mine"
+    other.mkdir()
+    (other / "thesis.tex").write_text("precious")
+    code, lines = typed("run", "fully_distributed", "--backend", "numeric", "--set", "run.duration_s=2", "--out", "mine")
+    assert code == 2
+    assert "is not a run of trainctl" in lines[0]
+    assert (other / "thesis.tex").read_text() == "precious"
+    assert [p.name for p in tmp_path.iterdir()] == ["mine"]
+
+
+def test_unknown_scenario_has_a_hint(typed):
+    code, lines = typed("run", "fully_distributd")
+    assert code == 2
+    assert lines == ["fully_distributd: no such scenario (see `trainctl list`) and no such file; did you mean fully_distributed?"]
