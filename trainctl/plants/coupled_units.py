@@ -111,7 +111,7 @@ def slope_at(x: float, gradient: Floats) -> float:
 @njit(cache=True, inline="always")
 def available(v: float, force: float, power: float) -> float:
     """Largest force at speed ``v`` [N] of a unit limited by ``force`` [N] and ``power`` [W]."""
-    return power / v if v * force > power else force
+    return power / v if v > 0.0 and v * force > power else force
 
 
 @njit(cache=True)

@@ -89,7 +89,7 @@ def demand(
             room = available(v, units[row, TRACTION], units[row, TRACTION_POWER]) - base
         else:
             room = available(v, units[row, BRAKING], units[row, BRAKING_POWER]) + base
-        if abs(extra) > room:
+        if abs(extra) > max(room, 0.0):
             scale = min(scale, max(room, 0.0) / abs(extra))
         pull = f
     if scale < 1.0:
