@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import pytest
@@ -252,9 +253,9 @@ def test_worst_case_of_a_scenario_attains_the_bound_with_measurement_noise_too()
         {**t, "shape": "worst_case", "pair": [1, 4], "peak_s": 1000.0}
         for t in [*PRINTED, {"on": "measurement", "amplitude_m": 0.5, "shape": "constant"}]
     ]
-    signals = disturbance.prepare(entries(tables), start.trains, T, None, lambda i, j, k: law.worst(PARAMS, start, i, j, k))
-    amplitude = disturbance.amplitudes(signals)
-    bound = robust_gain.gain(H, start, amplitude)
+    signals = disturbance.prepare(entries(tables), start.trains, T, None, partial(law.worst, PARAMS, start))
+    bound = law.analysis(PARAMS, start, entries(tables)).gain
+    assert bound is not None
     assert bound.worst_pair == ("1", "4")
     assert bound.worst_m > gain_of("line").worst_m + 1.0
     loop = Loop(start, lambda k, x: disturbance.at(signals, k, k * T, x))

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from pydantic import Field
@@ -117,7 +117,7 @@ def violations(params: Params, scene: Scene) -> list[str]:
 
     Notes
     -----
-    Assumption 2 beyond 0 < h T < 1 is not required: the paper's own example breaks it and runs all the same. ``report`` says so.
+    Assumption 2 beyond 0 < h T < 1 is not required: the paper's own example breaks it and runs all the same. ``analysis`` says so.
     """
     n = len(scene.trains)
     loop_faults = _gain_violations(params, scene) + _graph_violations(scene)
@@ -134,9 +134,9 @@ def _unstable(h: Floats, scene: Scene) -> list[str]:
         return []
     strongest = robust_gain.laplacian(len(h), scene.links).diagonal().max()
     return [
-        f"topology.weight = {scene.links.weight.max():g}: the loop is unstable with h = {h.max():g} and T = {scene.control_period:g} s "
-        f"(spectral radius {radius:.4f}); the weights one train hears with add up to {strongest:g}, Assumption 2 needs less than "
-        f"h^2/4 = {h.min() ** 2 / 4:.3g}"
+        f"topology.weight = {scene.links.weight.max():g}: unstable with h = {h.max():g} and T = {scene.control_period:g} s"
+        f" (spectral radius {radius:.4f}); the weights one train hears with add up to {strongest:g}, Assumption 2 needs less"
+        f" than h^2/4 = {h.min() ** 2 / 4:.3g}"
     ]
 
 
@@ -266,16 +266,39 @@ def warnings(params: Params, scene: Scene, tracks: Sequence[int] | None = None) 
     return found
 
 
-def report(params: Params, scene: Scene, amplitude: Floats, constant: Floats | None = None) -> robust_theory.Report:
-    """Theorem 1, l1 bound and steady state of the largest formation; arguments as of ``robust_theory.report``."""
-    parts = robust_gain.formations(scene)
+class Disturbing(Protocol):
+    """What the analysis asks of an entry of the scenario's disturbances; see ``plants.disturbance``."""
+
+    def greatest(self, trains: Sequence[str]) -> Floats:
+        """Greatest magnitude on each channel of each train, shape (5, n)."""
+
+    def steady(self, trains: Sequence[str]) -> Floats | None:
+        """Value on each channel of each train, shape (5, n), if it never changes."""
+
+
+def analysis(params: Params, scene: Scene, disturbances: Sequence[Disturbing]) -> robust_theory.Report:
+    """Theorem 1, l1 bound and, under constant disturbances, the steady state: of the largest formation of the scene."""
+    n, parts = len(scene.trains), robust_gain.formations(scene)
     members = max(parts, key=len)
+    amplitude, constant = np.zeros((5, n)), np.zeros((5, n))
+    changing = False
+    for entry in disturbances:
+        amplitude = amplitude + entry.greatest(scene.trains)
+        value = entry.steady(scene.trains)
+        changing |= value is None
+        constant = constant + (0.0 if value is None else value)
     alone = robust_gain.restrict(scene, members)
-    steady = None if constant is None else constant[:, members]
-    found = robust_theory.report(gains(params, len(scene.trains))[members], alone, amplitude[:, members], steady)
+    found = robust_theory.report(
+        gains(params, n)[members], alone, amplitude[:, members], None if changing else constant[:, members]
+    )
     if len(parts) > 1:
         found.notes.append(f"{len(parts)} separate formations: the report is of trains {_some(alone.trains, ', ')}")
     return found
+
+
+def report(params: Params, scene: Scene, disturbances: Sequence[Disturbing]) -> list[str]:
+    """Lines of ``analysis`` for the terminal."""
+    return analysis(params, scene, disturbances).lines()
 
 
 def worst(params: Params, scene: Scene, plus: int, minus: int, steps: int) -> Floats:

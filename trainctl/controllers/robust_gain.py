@@ -324,7 +324,8 @@ class Steady:
     """Exact state in the long run under constant disturbances, no clamp acting: L phat = -h (s - w1)/T + w2/T + w3."""
 
     drift_m: float  # s, per step, beyond v0 T
-    speed_mps: list[float]  # of the state; the positions move with drift_m / T more than v0
+    speed_mps: list[float]  # of the state
+    moves_mps: float  # of the positions, w1 / T more: what SUMO's logs show as speed
     pairs: list[tuple[str, str]]
     error_m: list[float]  # p_i - p_j - d_ij
     input_mps2: list[float]  # u_c + w3
@@ -336,7 +337,8 @@ class Steady:
         low, high = min(self.speed_mps), max(self.speed_mps)
         speed = f"{low:.4f}" if high - low < 5e-5 else f"{low:.4f} to {high:.4f}"
         return [
-            f"steady state under the constant disturbances: speed {speed} m/s, drift {self.drift_m:.4f} m per step beyond v0 T",
+            f"steady state under the constant disturbances: speed {speed} m/s; the trains move {self.moves_mps:.4f} m/s, w1 / T more,"
+            " which SUMO logs as speed",
             f"  errors p_i - p_j - d_ij [m]: {shown}" + (" ..." if len(self.pairs) > 15 else ""),
             *([] if self.unsaturated else ["  a clamp would act there: this state is not reached"]),
         ]
@@ -420,6 +422,7 @@ def steady_state(h: Floats, scene: Scene, constant: Floats) -> Steady:
     inside &= (v0 + vbar >= scene.bounds.speed_lower) & (v0 + vbar <= scene.bounds.speed_upper)
     pairs = pair_rows(n, scene.links)
     return Steady(
-        drift_m=s, speed_mps=(v0 + vbar).tolist(), pairs=[(scene.trains[i], scene.trains[j]) for i, j in pairs],
+        drift_m=s, speed_mps=(v0 + vbar).tolist(), moves_mps=v0 + s / T,
+        pairs=[(scene.trains[i], scene.trains[j]) for i, j in pairs],
         error_m=[float(p[i] - p[j]) for i, j in pairs], input_mps2=asked.tolist(), unsaturated=bool(inside.all()),
     )  # fmt: skip

@@ -79,14 +79,15 @@ class Theorem:
                 f"bound {self.bound_m:.3g} m: eta1 {min(self.eta1):.4g}, eta2 {min(self.eta2):.4g}, c {max(self.c_s):.4g} s, "
                 f"mubar {self.mubar:.4g}, lambda1 {self.lambda1:.3g}, lambda2 {self.lambda2_m:.4g} m"
             )
-        return [
-            f"Theorem 1: {'holds' if self.holds else 'does not apply'}; {value}",
-            *(f"  violated: {v}" for v in self.violated),
-            f"  most charitable reading (eta2 = 1): mubar {self.charitable_mubar:.4g}, bound {self.charitable_bound_m:.3g} m; "
-            f"with these gains and amplitudes no graph gives less than {self.least_bound_m:.3g} m",
-            f"  the paper states {PRINTED_BOUND:g} m for its example: not reproducible, it needs mubar = {self.needed_mubar:.4f} "
-            f"but mubar <= h T / 2 = {max(self.h_t) / 2:.3g}",
-        ]
+        lines = [f"Theorem 1: {'holds' if self.holds else 'does not apply'}; {value}", *(f"  violated: {v}" for v in self.violated)]
+        if self.least_bound_m > 0.0:
+            lines += [
+                f"  most charitable reading (eta2 = 1): mubar {self.charitable_mubar:.4g}, bound {self.charitable_bound_m:.3g} m; "
+                f"with these gains and amplitudes no graph gives less than {self.least_bound_m:.3g} m",
+                f"  the paper states {PRINTED_BOUND:g} m for its example: not reproducible, it needs mubar = "
+                f"{self.needed_mubar:.4f} but mubar <= h T / 2 = {max(self.h_t) / 2:.3g}",
+            ]
+        return lines
 
 
 def start_spread(p: Floats, v: Floats, c: Floats) -> float:
@@ -244,9 +245,9 @@ def report(h: Floats, scene: Scene, amplitude: Floats, constant: Floats | None) 
     scene : Scene
         The start.
     amplitude : ndarray, shape (5, n)
-        Greatest magnitudes, see ``plants.disturbance.amplitudes``.
+        Greatest magnitudes, see ``plants.disturbance``.
     constant : ndarray, shape (5, n), or None
-        The disturbances, if they are constant, see ``plants.disturbance.constant``.
+        The disturbances, if they are constant.
     """
     n, notes, bound, steady = len(scene.trains), [], None, None
     extra = amplitude[RESISTANCE] * robust_gain.greatest_resistance(scene)
@@ -259,6 +260,8 @@ def report(h: Floats, scene: Scene, amplitude: Floats, constant: Floats | None) 
         notes.append(
             f"{n} trains: the steady state is computed up to {robust_gain.DENSE}, the l1 bound up to {robust_gain.BOUNDED}"
         )
+    elif not amplitude.any():
+        notes.append("no disturbance: every error ends at 0")
     elif robust_gain.radius(robust_gain.loop(h, scene)) >= 1.0:
         notes.append("the loop is unstable: no bound on the formation error")
     else:

@@ -133,6 +133,28 @@ class Disturbance(Table):
         """Trains named; ("all",) for all."""
         return tuple(str(t) for t in self.train) if isinstance(self.train, tuple) else (str(self.train),)
 
+    def greatest(self, trains: Sequence[str]) -> Floats:
+        """Greatest magnitude on each channel of each of all ``trains``, shape (5, n).
+
+        Windows in time and place are ignored. A Gaussian that no amplitude cuts off has no bound: inf. The row of the resistance is
+        a relative error, not a factor.
+        """
+        given = getattr(self, self.amplitude_key)
+        return self._spread(trains, math.inf if given is None else given, np.abs)
+
+    def steady(self, trains: Sequence[str]) -> Floats | None:
+        """Value on each channel of each of all ``trains``, shape (5, n), if it never changes; else None."""
+        if self.shape != "constant" or any(x is not None for x in (self.from_s, self.to_s, self.from_m, self.to_m)):
+            return None
+        return self._spread(trains, getattr(self, self.amplitude_key), np.positive)
+
+    def _spread(self, trains: Sequence[str], value: PerTrain, kind: Callable[[Floats], Floats]) -> Floats:
+        index = {name: i for i, name in enumerate(trains)}
+        places = [index[name] for name in (trains if self.trains == ("all",) else self.trains)]
+        out = np.zeros((len(CHANNELS), len(trains)))
+        out[self.channel, places] = kind(np.asarray(value, float)) * (0.01 if self.channel == RESISTANCE else 1.0)
+        return out
+
     @model_validator(mode="after")
     def _keys_of_this_shape(self) -> Disturbance:
         """All mistakes of the table at once."""
@@ -220,8 +242,8 @@ def violations(entries: Sequence[Disturbance], trains: Sequence[str], seed: int 
         for name in entry.trains:
             if name not in trains and entry.trains != ("all",):
                 found.append(f"{here}.train = {name}: no such train; there are: {', '.join(trains)}")
-        for name in entry.pair or ():
-            if str(name) not in trains:
+        for name in map(str, entry.pair or ()):
+            if name not in trains:
                 found.append(f"{here}.pair = {name}: no such train; there are: {', '.join(trains)}")
         for key in (entry.amplitude_key, entry.std_key):
             value = getattr(entry, key)
@@ -374,26 +396,3 @@ def philox(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, i
         c0, c1, c2, c3 = (b >> 32 & WORD) ^ c1 ^ k0, b & WORD, (a >> 32 & WORD) ^ c3 ^ k1, a & WORD
         k0, k1 = k0 + 0x9E3779B9 & WORD, k1 + 0xBB67AE85 & WORD
     return c0, c1, c2, c3
-
-
-def amplitudes(signals: Signals) -> Floats:
-    """Greatest magnitude of the sum of all entries on each channel of each train, shape (5, n).
-
-    Windows in time and place are ignored: overlapping or not, entries count in full. A Gaussian without an amplitude has no
-    bound: inf. The resistance row is a relative error, not a factor.
-    """
-    out = np.zeros((len(CHANNELS), signals.trains))
-    np.add.at(out, (signals.whole[:, ON], signals.whole[:, TRAIN]), np.abs(signals.number[:, AMPLITUDE]))
-    return out
-
-
-def constant(signals: Signals) -> Floats | None:
-    """Return the values on each channel of each train, shape (5, n), if they never change; None if any of them does."""
-    steady = np.isin(signals.whole[:, SHAPE], (CONSTANT,)) & np.all(
-        signals.number[:, FROM_S : TO_M + 1] == (0.0, math.inf, -math.inf, math.inf), axis=1
-    )
-    if not steady.all():
-        return None
-    out = np.zeros((len(CHANNELS), signals.trains))
-    np.add.at(out, (signals.whole[:, ON], signals.whole[:, TRAIN]), signals.number[:, AMPLITUDE])
-    return out
