@@ -112,7 +112,7 @@ def test_demand_is_local() -> None:
     )
 
 
-# --- what it refuses ---------------------------------------------------------------------------------------------------------------
+# --- what it refuses ---
 
 
 def test_the_example_breaks_nothing() -> None:
@@ -207,7 +207,7 @@ def test_large_formations_are_checked() -> None:
     assert law.violations(PARAMS, scene(edges, n)) == []
 
 
-# --- the analysis ------------------------------------------------------------------------------------------------------------------
+# --- the analysis ---
 
 
 def test_analysis_of_kinds_of_disturbances() -> None:

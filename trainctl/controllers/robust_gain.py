@@ -337,7 +337,7 @@ class Steady:
         low, high = min(self.speed_mps), max(self.speed_mps)
         speed = f"{low:.4f}" if high - low < 5e-5 else f"{low:.4f} to {high:.4f}"
         return [
-            f"steady state under the constant disturbances: speed {speed} m/s; the trains move {self.moves_mps:.4f} m/s, w1 / T more,"
+            f"steady state under the constant disturbances: speed {speed} m/s; they move {self.moves_mps:.4f} m/s, w1 / T more,"
             " which SUMO logs as speed",
             f"  errors p_i - p_j - d_ij [m]: {shown}" + (" ..." if len(self.pairs) > 15 else ""),
             *([] if self.unsaturated else ["  a clamp would act there: this state is not reached"]),
