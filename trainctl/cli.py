@@ -139,7 +139,9 @@ def _summary(done: Run, prepared: Prepared) -> None:
     table = _table(None, "", "")
     table.show_header = False
     law = prepared.scenario.controller.law
-    table.add_row("law, plant", f"{law} on {prepared.scenario.plant.kind}, {len(prepared.scenario.train)} trains, backend {info['backend']}")
+    table.add_row(
+        "law, plant", f"{law} on {prepared.scenario.plant.kind}, {len(prepared.scenario.train)} trains, backend {info['backend']}"
+    )
     table.add_row("steps", f"{info['steps']} of {prepared.scenario.run.step_s:g} s in {info['wall_time_s']:.1f} s")
     for key, words, unit in (
         ("bounds.spacing_lower_margin_m", "least spacing above its lower bound", "m"),
@@ -162,13 +164,11 @@ def _summary(done: Run, prepared: Prepared) -> None:
 @app.command("list")
 def list_(as_json: Json = False) -> None:
     """List the scenarios that come with the package."""
-    import tomllib
-
-    from trainctl.scenario import shipped
+    from trainctl.scenario import read, shipped
 
     rows = []
-    for name, path in shipped().items():
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    for name in shipped():
+        data, path = read(name)
         rows.append({"name": name, "law": data["controller"]["law"], "title": data["title"], "file": str(path)})
     if as_json:
         _print_json(rows)
@@ -204,7 +204,9 @@ def check(name: ScenarioName = DEFAULT_SCENARIO, settings: Settings = None, as_j
 
 @app.command()
 def metrics(
-    folder: Annotated[Path | None, typer.Argument(help="Run folder, or an FCD file of SUMO's (.xml, .xml.gz, .csv, .parquet).")] = None,
+    folder: Annotated[
+        Path | None, typer.Argument(help="Run folder, or an FCD file of SUMO's (.xml, .xml.gz, .csv, .parquet).")
+    ] = None,
     band_m: Annotated[float, typer.Option(help="Band for settling of spacings [m].")] = 1.0,
     section_m: Annotated[float | None, typer.Option(help="Kilometrage at which trains are counted [m].")] = None,
     everything: Annotated[bool, typer.Option("--all", help="Also the values of each train, link and unit.")] = False,
@@ -230,7 +232,7 @@ def metrics(
 
         values = measured.metrics(Run(folder), band_m=band_m, section_m=section_m)
     else:
-        from trainctl.record.sumo_logs import metrics_of_fcd
+        from trainctl.record.traffic import metrics_of_fcd
 
         values = metrics_of_fcd(folder)
     if as_json:
@@ -286,7 +288,9 @@ def net_list() -> None:
     table = _table(None, "name", "tracks", "kilometrage", "crossovers")
     for name, path in sumo_net.shipped().items():
         line = sumo_net.Line.of(_line_spec(str(path)))
-        table.add_row(name, ", ".join(line.track_ids), f"{line.begin_m / 1000:g} .. {line.end_m / 1000:g} km", str(len(line.crossovers)))
+        table.add_row(
+            name, ", ".join(line.track_ids), f"{line.begin_m / 1000:g} .. {line.end_m / 1000:g} km", str(len(line.crossovers))
+        )
     _print(table)
 
 
@@ -347,7 +351,9 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
-    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Versions of trainctl and SUMO.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Versions of trainctl and SUMO.")
+    ] = False,
 ) -> None:
     """Closed-loop testbed for cooperative train control on SUMO rail networks."""
 

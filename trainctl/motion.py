@@ -63,14 +63,18 @@ class Units:
         self.gradient = np.column_stack([p.line.gradient.breaks, p.line.gradient.slope])
         if not self.gradient[:, 1].any():
             self.gradient = np.zeros((0, 2))
-        self.plant: Any = (
-            coupled_units.constants(p.plant_params, p.consists, self.gradient)
-            if p.scenario.plant.kind == "coupled_units"
-            else actuated_units.constants(p.plant_params, p.first_scene, p.scenario.fault)
-        )
+        self.plant: Any
+        if p.scenario.plant.kind == "coupled_units":
+            self.plant = coupled_units.constants(p.plant_params, p.consists, self.gradient)
+        else:
+            self.plant = actuated_units.constants(
+                p.plant_params, p.consists, self.gradient, faults=p.scenario.fault, trains=p.scenario.ids
+            )
         noisy = p.scenario.plant.kind == "actuated_units" and p.plant_params.noise_variance_m2_per_s6 > 0.0
         self.noise_hold = p.plant_params.noise_hold_s if noisy else None
-        self.breaks = np.unique(np.concatenate([p.reference.breaks[np.isfinite(p.reference.breaks)], faults.breaks(p.scenario.fault)]))
+        self.breaks = np.unique(
+            np.concatenate([p.reference.breaks[np.isfinite(p.reference.breaks)], faults.breaks(p.scenario.fault)])
+        )
         self.masses = p.consists.train_mass()
         self.extremes = self._fresh()
         self.counted = -1  # number of the last exchange
@@ -169,12 +173,11 @@ class Units:
         if self.noise_hold is None:
             return
         sample = math.floor(t / self.noise_hold + 1e-6)
-        self.plant.noise[:] = actuated_units.noise(self.p.plant_params, self.p.scenario.run.seed or 0, sample, len(self.estimate))
+        noise = actuated_units.noise(self.p.plant_params, self.p.scenario.run.seed or 0, sample, len(self.estimate))
+        self.plant.units[:, actuated_units.NOISE] = noise
 
     def _disturb(self, disturbed: Disturbed) -> None:
         """Hand this step's disturbing forces and resistance errors to the plant."""
-        if self.p.scenario.plant.kind != "coupled_units":
-            return
         units = np.diff(self.p.consists.first)
         table = self.plant.units
         table[:, coupled_units.PUSH] = np.repeat(disturbed.input, units)

@@ -280,17 +280,23 @@ def _on_the_line(scenario: Scenario, line: Line) -> list[str]:
         if t.track not in line.track_ids:
             found.append(f"{here}.track = {t.track}: no such track; there are: {', '.join(line.track_ids)}")
         elif not line.begin_m <= t.position_m <= line.end_m:
-            found.append(f"{here}.position_m = {t.position_m:.10g}: off the line, which is {line.begin_m:.10g} .. {line.end_m:.10g} m")
+            found.append(
+                f"{here}.position_m = {t.position_m:.10g}: off the line, which is {line.begin_m:.10g} .. {line.end_m:.10g} m"
+            )
         else:
             kind = scenario.train_type[t.type]
             length = math.fsum(kind.per_unit("unit_length_m"))
             if t.position_m - length < line.begin_m:
                 tail = t.position_m - length
-                found.append(f"{here}.position_m = {t.position_m:.10g}: its tail at {tail:.10g} m is off the line, which begins at {line.begin_m:.10g} m")
+                found.append(
+                    f"{here}.position_m = {t.position_m:.10g}: its tail at {tail:.10g} m is off the line, which begins at {line.begin_m:.10g} m"
+                )
             placed.append((t.track, t.position_m, length, t.id))
     for (track, x, length, i), (other, y, _, j) in pairwise(sorted(placed, key=lambda p: (p[0], -p[1]))):
-        if track == other and y > x - length or (track == other and y == x):
-            found.append(f"train[{j}].position_m = {y:.10g}: overlaps train {i} on track {track}, whose rear is at {x - length:.10g} m")
+        if (track == other and y > x - length) or (track == other and y == x):
+            found.append(
+                f"train[{j}].position_m = {y:.10g}: overlaps train {i} on track {track}, whose rear is at {x - length:.10g} m"
+            )
     where = {t.id: (t.track, t.position_m, t) for t in scenario.train}
     for k, event in sorted(enumerate(scenario.event, 1), key=lambda e: e[1].time_s):
         track, at_least, t = where[event.train]
@@ -323,7 +329,9 @@ def _reroute(
         return track, at_least
     crossover = named[event.crossover]
     if crossover.from_track != track:
-        found.append(f"{here}.crossover = {crossover.id}: leaves track {crossover.from_track}, train {event.train} is on track {track}")
+        found.append(
+            f"{here}.crossover = {crossover.id}: leaves track {crossover.from_track}, train {event.train} is on track {track}"
+        )
     elif crossover.start_m <= passed:
         found.append(
             f"{here}.crossover = {crossover.id}: its switch at {crossover.start_m:.10g} m has been passed, train {event.train}"
@@ -363,7 +371,10 @@ def _resolved(scenario: Scenario, bounds: Bounds) -> Scenario:
     if len(set(low)) == len(set(high)) == 1:
         table = scenario.bounds.model_copy(update={"input_lower_mps2": low[0], "input_upper_mps2": high[0]})
         return scenario.model_copy(update={"bounds": table})
-    own = [t.model_copy(update={"input_lower_mps2": a, "input_upper_mps2": b}) for t, a, b in zip(scenario.train, low, high, strict=True)]
+    own = [
+        t.model_copy(update={"input_lower_mps2": a, "input_upper_mps2": b})
+        for t, a, b in zip(scenario.train, low, high, strict=True)
+    ]
     return scenario.model_copy(update={"train": tuple(own)})
 
 
@@ -377,17 +388,26 @@ def _fits(p: Prepared) -> list[str]:
     if p.scenario.observer.kind not in known:
         found.append(f"observer.kind = {p.scenario.observer.kind}: law {p.scenario.controller.law} works with {', '.join(known)}")
     for i, t in enumerate(p.scenario.train):
-        for key, low, high in (("speed", p.bounds.speed_lower[i], p.bounds.speed_upper[i]), ("input", p.bounds.input_lower[i], p.bounds.input_upper[i])):
+        for key, low, high in (
+            ("speed", p.bounds.speed_lower[i], p.bounds.speed_upper[i]),
+            ("input", p.bounds.input_lower[i], p.bounds.input_upper[i]),
+        ):
             if not low < high:
                 found.append(f"train[{t.id}]: {key} bounds {low:g} .. {high:g} are empty")
     found += [*_messages_fit(p), *_disturbances_fit(p)]
     if p.scenario.plant.kind != "point" and p.sampled:
-        least, greatest = shared.room(p.consists, p.scenario.bounds_of_trains().speed_lower, p.scenario.bounds_of_trains().speed_upper)
+        least, greatest = shared.room(
+            p.consists, p.scenario.bounds_of_trains().speed_lower, p.scenario.bounds_of_trains().speed_upper
+        )
         for i, t in enumerate(p.scenario.train):
             if p.bounds.input_lower[i] < least[i] - 1e-12:
-                found.append(f"train[{t.id}].input_lower_mps2 = {p.bounds.input_lower[i]:g}: its units can brake with {-least[i]:.6g} m/s2 at most")
+                found.append(
+                    f"train[{t.id}].input_lower_mps2 = {p.bounds.input_lower[i]:g}: its units can brake with {-least[i]:.6g} m/s2 at most"
+                )
             if p.bounds.input_upper[i] > greatest[i] + 1e-12:
-                found.append(f"train[{t.id}].input_upper_mps2 = {p.bounds.input_upper[i]:g}: its units can give {greatest[i]:.6g} m/s2 at most at the upper speed bound")
+                found.append(
+                    f"train[{t.id}].input_upper_mps2 = {p.bounds.input_upper[i]:g}: its units can give {greatest[i]:.6g} m/s2 at most at the upper speed bound"
+                )
     return found
 
 
@@ -408,9 +428,17 @@ def _messages_fit(p: Prepared) -> list[str]:
     run, top = p.scenario.run, p.scenario.topology
     period = top.communication_period_s
     if p.sampled:
-        return [] if period is None else ["topology.communication_period_s: sampled laws exchange once per control period; leave it out"]
+        return (
+            []
+            if period is None
+            else ["topology.communication_period_s: sampled laws exchange once per control period; leave it out"]
+        )
     if period is None:
-        return ["topology.communication_period_s: missing; loss and delay need messages sent at instants"] if top.loss + top.delay_s > 0 else []
+        return (
+            ["topology.communication_period_s: missing; loss and delay need messages sent at instants"]
+            if top.loss + top.delay_s > 0
+            else []
+        )
     ratio = run.step_s / period
     if min(abs(ratio - round(ratio)), abs(1 / ratio - round(1 / ratio))) > 1e-9:
         return [f"topology.communication_period_s = {period:g}: must divide step_s = {run.step_s:g} or be a multiple of it"]
@@ -427,8 +455,6 @@ def _disturbances_fit(p: Prepared) -> list[str]:
     for k, entry in enumerate(scenario.disturbance, 1):
         if entry.on == "measurement" and not p.sampled:
             found.append(f"disturbance[{k}].on = measurement: needs a sampled law; a continuous one has no instants to measure at")
-        if entry.on in ("input", "resistance") and scenario.plant.kind == "actuated_units":
-            found.append(f"disturbance[{k}].on = {entry.on}: not in actuated_units, which has [[fault]] and [plant] noise instead")
     if scenario.fault and scenario.plant.kind != "actuated_units":
         found.append(f"fault: the plant {scenario.plant.kind} has no actuators that fail; actuated_units has")
     if scenario.plant.kind == "actuated_units":

@@ -62,13 +62,15 @@ def run(
     partial = claim(out, force)
     text = p.scenario.toml()
     (partial / "scenario.toml").write_text(text, encoding="utf-8")
-    info = about_run(text, p.scenario.run.seed, command_line or sys.argv, backend=backend)
+    info = about_run(text, p.scenario.run.seed or 0, command_line or sys.argv, backend=backend)
     write_info(partial, info)
     began, journal, world, simulation = time.perf_counter(), None, None, None
 
     def ended(status: str, **more: Any) -> None:
         steps = simulation.k if simulation is not None else 0
-        write_info(partial, {**info, "status": status, "steps": steps, "wall_time_s": round(time.perf_counter() - began, 3), **more})
+        write_info(
+            partial, {**info, "status": status, "steps": steps, "wall_time_s": round(time.perf_counter() - began, 3), **more}
+        )
 
     try:
         journal = Journal(partial, p)

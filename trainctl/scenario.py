@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
+from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 
 from trainctl.errors import InputError
 from trainctl.plants.disturbance import Disturbance
@@ -26,9 +26,16 @@ from trainctl.signals import Bounds, Consists, Table
 
 SCHEMA_VERSION = 1
 
+
+
+def _name(value: Any) -> Any:
+    """Ids are text; a number may stand for one."""
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
-Id = Annotated[int | str, AfterValidator(str)]
+Id = Annotated[str, BeforeValidator(_name, json_schema_input_type=int | str)]
 PerUnit = float | tuple[float, ...]
 
 
@@ -40,7 +47,9 @@ class Run(Table):
     control_period_s: Positive | None = Field(
         None, description="Control period T_c of sampled laws [s], a multiple of step_s; default step_s."
     )
-    sub_step_s: Positive = Field(0.01, description="Largest integration step inside a simulator step [s]; not used by the point plant.")
+    sub_step_s: Positive = Field(
+        0.01, description="Largest integration step inside a simulator step [s]; not used by the point plant."
+    )
     record_every_s: Positive | None = Field(
         None, description="Time between recorded rows of trains, units and links [s]; default every step. Extremes stay exact."
     )
@@ -136,7 +145,9 @@ class Link(Table):
     lower_m: float | None = Field(None, description="Least spacing [m]; default the sum over the consecutive links it spans.")
     upper_m: float | None = Field(None, description="Greatest spacing [m]; default the sum over the consecutive links it spans.")
     weight: float | None = Field(None, description="Weight a_ij of this link.")
-    extra: bool = Field(False, description="With rule = same_track: exists whenever both trains are on one track, neighbours or not.")
+    extra: bool = Field(
+        False, description="With rule = same_track: exists whenever both trains are on one track, neighbours or not."
+    )
 
     @model_validator(mode="after")
     def _ends(self) -> Link:
@@ -232,7 +243,9 @@ class Event(Table):
 
     kind: Literal["reroute"] = Field(description="reroute: the train takes a crossover to another track and stays there.")
     train: Id = Field(description="The train.")
-    crossover: str | None = Field(None, description="Id of the crossover (see `trainctl net show`); default: the next one to to_track.")
+    crossover: str | None = Field(
+        None, description="Id of the crossover (see `trainctl net show`); default: the next one to to_track."
+    )
     to_track: Id | None = Field(None, description="Track to change to, if no crossover is named.")
     time_s: NotNegative = Field(0.0, description="When the route is ordered [s]; the train changes track when it gets there.")
 
@@ -545,7 +558,9 @@ def mistakes(error: ValidationError, data: dict[str, Any], under: str = "", mode
         if e["type"] == "extra_forbidden":
             known = _known(loc, model)
             near = difflib.get_close_matches(str(loc[-1]), known, n=1)
-            rule = "unknown key" + (f"; did you mean {near[0]}?" if near else "") + (f"; known: {', '.join(known)}" if known else "")
+            rule = (
+                "unknown key" + (f"; did you mean {near[0]}?" if near else "") + (f"; known: {', '.join(known)}" if known else "")
+            )
             lines.append(f"{key}: {rule}")
         elif e["type"] == "missing":
             lines.append(f"{key}: missing")

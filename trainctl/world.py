@@ -1,4 +1,4 @@
-"""Where trains are, seen from the loop: SUMO (``trainctl.sumo``) or, for ``--backend numeric``, plain arithmetic on the same line."""
+"""Where trains are, seen from the loop: SUMO (``trainctl.sumo``) or plain arithmetic on the same line (``--backend numeric``)."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ class Journal:
         joined = ~self.last
         stretch[joined] = own[:-1, POSITION][joined[:-1]] - own[1:, POSITION][joined[:-1]] - p.consists.length[joined]
         rate[joined] = own[:-1, SPEED][joined[:-1]] - own[1:, SPEED][joined[:-1]]
-        force = missing if row.motion is None else row.motion.force
+        force: Floats = missing if row.motion is None or row.motion.force is None else row.motion.force
         x = row.extremes
         assert x is not None
         self.recorder.write(

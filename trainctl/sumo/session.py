@@ -18,6 +18,7 @@ import numpy as np
 from sumo_net import Line
 from trainctl.errors import CouplingError, SimulatorError
 from trainctl.signals import Floats, Ints
+from trainctl.sumo.preflight import objections
 from trainctl.world import Seen, Start
 
 #: Speed mode 32 switches off every speed correction of SUMO's; each inserted train starts with all of them on (31).
@@ -47,11 +48,6 @@ OPTIONS = {
     "log": "messages.log",
     "no-warnings": "false",
 }
-
-
-def version() -> str:
-    """Version of SUMO, as ``1.28.0``."""
-    return str(libsumo.getVersion()[1]).removeprefix("SUMO ")
 
 
 def write_routes(start: Start, path: Path) -> None:
@@ -100,6 +96,9 @@ class Sumo:
         """Load the net, insert the trains, verify each of them, and take every speed correction off."""
         if libsumo.simulation.isLoaded():
             raise SimulatorError("SUMO already runs in this process; it can hold one simulation at a time")
+        wrong = objections(self.line, self.time_step)
+        if wrong:
+            raise SimulatorError("; ".join(wrong))
         write_routes(start, self.folder / "trains.rou.xml")
         end = (self.steps + 1) * self.time_step
         configuration = write_configuration(self.folder, self.net.name, "trains.rou.xml", self.time_step, end)
@@ -144,7 +143,9 @@ class Sumo:
                 edge[i] = self.index[road(name)]
                 position[i] = lane_position(name)
         except (libsumo.TraCIException, KeyError) as error:
-            raise CouplingError(f"train {name} is not on the line at {self._time():.3f} s: {error}; did it reach the line's end?") from None
+            raise CouplingError(
+                f"train {name} is not on the line at {self._time():.3f} s: {error}; did it reach the line's end?"
+            ) from None
         position += self.line.start_m[edge]
         return Seen(position, edge)
 
@@ -203,7 +204,7 @@ class Sumo:
         return float(libsumo.simulation.getTime()) - self.time_step
 
     def _call(self, function: Any, *arguments: Any) -> Any:
-        """libsumo's own errors in the project's words."""
+        """Libsumo's own errors in the project's words."""
         try:
             return function(*arguments)
         except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:

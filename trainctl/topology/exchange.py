@@ -52,6 +52,8 @@ class Exchange:
         """
         if self.heard.shape != (len(links.sender), sent.shape[1]):  # the first message tells its width
             self.heard = np.zeros((len(links.sender), sent.shape[1]))
+        if len(self.ever) != len(links.sender):
+            self.ever = np.zeros(len(links.sender), bool)
         self.sent.append(sent)
         if len(self.sent) > self.delay + 1:
             self.sent.popleft()

@@ -7,6 +7,7 @@ Spacings are front to front.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -86,7 +87,7 @@ def in_order(order: Ints, position: Floats, track: Ints) -> bool:
 
 def pairs(plan: Plan, order: Ints, track: Ints) -> list[tuple[int, int]]:
     """Undirected edges (ahead, behind) of rule "same_track", front to rear."""
-    near = [(int(a), int(b)) for a, b in zip(order[:-1], order[1:], strict=True) if track[a] == track[b]]
+    near = [(int(a), int(b)) for a, b in pairwise(order) if track[a] == track[b]]
     known = set(near)
     more = [(a, b) for a, b in plan.extra if track[a] == track[b] and (a, b) not in known]
     return near + more
@@ -138,7 +139,7 @@ def components(n: int, sender: Ints, receiver: Ints) -> list[list[int]]:
 
 
 def edges(now: Links, ids: Sequence[str]) -> list[list[str]]:
-    """The edge list in words, for an event: undirected edges once with the train ahead first, one-way links as [sender, receiver]."""
+    """The edge list by names: undirected edges once with the train ahead first, one-way links as [sender, receiver]."""
     directed = {(int(s), int(r)): d for s, r, d in zip(now.sender, now.receiver, now.desired, strict=True)}
     rank = {int(i): k for k, i in enumerate(now.order)}
     seen = [(s, r) for s, r in directed if (r, s) not in directed or rank[s] < rank[r]]

@@ -1,0 +1,104 @@
+"""The command line as a user types it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+BIN = Path(sys.executable).parent / "trainctl"
+
+
+def typed(*arguments, cwd=None):
+    return subprocess.run([BIN, *map(str, arguments)], capture_output=True, text=True, cwd=cwd, check=False)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("user")
+    done = typed("run", "fully_distributed", "--backend", "numeric", "--set", "run.duration_s=50", "--strict", cwd=place)
+    assert done.returncode == 0, done.stderr
+    assert "runs/fully_distributed" in done.stdout
+    return place / "runs" / "fully_distributed"
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys, trainctl.cli; heavy = {'numpy', 'numba', 'pandas', 'libsumo', 'matplotlib', 'pydantic', 'rich'};"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+
+
+def test_help_names_every_command():
+    text = typed("--help").stdout
+    for command in ("run", "list", "check", "metrics", "plot", "net", "schema"):
+        assert f" {command} " in text
+
+
+def test_a_finished_run_can_be_replaced_and_leaves_nothing_partial(folder):
+    assert (
+        typed(
+            "run", "fully_distributed", "--backend", "numeric", "--set", "run.duration_s=50", "-q", cwd=folder.parents[1]
+        ).returncode
+        == 0
+    )
+    assert [p.name for p in folder.parent.iterdir()] == ["fully_distributed"]
+    assert json.loads((folder / "run.json").read_text())["status"] == "complete"
+
+
+def test_strict_is_exit_1_when_a_bound_broke(tmp_path):
+    arguments = ("run", "fully_distributed_ratchet", "--backend", "numeric", "--set", "run.duration_s=1010", "-q")
+    assert typed(*arguments, "--out", "a", cwd=tmp_path).returncode == 0
+    assert typed(*arguments, "--out", "b", "--strict", cwd=tmp_path).returncode == 1
+
+
+def test_metrics_in_words_and_for_machines(folder):
+    values = json.loads(typed("metrics", folder, "--json").stdout)
+    assert values["run.duration_s"] == 50.0
+    assert "bounds.spacing_lower_margin_m" in typed("metrics", folder).stdout
+    assert "bounds.speed_upper_margin_mps" in json.loads(typed("metrics", "--list", "--json").stdout)
+
+
+def test_list_check_and_schema_are_json_too():
+    assert "three_tracks" in {row["name"] for row in json.loads(typed("list", "--json").stdout)}
+    facts = json.loads(typed("check", "three_tracks", "--json").stdout)
+    assert facts["smallest_control_period_s"] == pytest.approx(6.265, abs=1e-3)
+    assert "train_type" in json.loads(typed("schema").stdout)["properties"]
+
+
+def test_figures_are_written(folder):
+    done = typed("plot", folder)
+    assert done.returncode == 0, done.stderr
+    files = [Path(line) for line in done.stdout.split()]
+    assert {"fig3_positions.png", "fig6_inputs.png", "train_graph.png"} <= {p.name for p in files}
+    assert all(p.stat().st_size > 5000 for p in files)
+
+
+def test_net_is_built_and_shown(tmp_path):
+    assert typed("net", "build", "single_track", "--out", tmp_path).returncode == 0
+    assert (tmp_path / "single_track.net.xml").is_file()
+    assert typed("net", "show", tmp_path / "single_track.net.xml", "--out", tmp_path / "line.png").returncode == 0
+    assert (tmp_path / "line.png").stat().st_size > 5000
+    assert "three_tracks" in typed("net", "list").stdout
+
+
+def test_an_interrupted_run_says_so(tmp_path):
+    run = subprocess.Popen(
+        [BIN, "run", "three_tracks", "--backend", "numeric", "-q", "--set", "run.duration_s=4000", "--out", "r"],
+        cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    begun = tmp_path / "r.partial" / "events.jsonl"
+    deadline = time.monotonic() + 60
+    while not (begun.exists() and begun.stat().st_size) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    run.send_signal(2)
+    assert run.wait(30) == 130
+    run.stderr.close()
+    info = json.loads((tmp_path / "r.partial" / "run.json").read_text())
+    assert info["status"] == "interrupted"
+    assert not (tmp_path / "r").exists()
