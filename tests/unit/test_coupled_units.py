@@ -253,3 +253,9 @@ def test_unlimited_units_leave_no_smallest_period() -> None:
     one = np.ones(1)
     assert shared.smallest_period(train(limits=False), 80.0 * one, 79.0 * one, 85.0 * one).tolist() == [0.0]
     assert shared.room(train(limits=False), 0.0 * one, 85.0 * one)[1].tolist() == [np.inf]
+
+
+def test_unbounded_speed_leaves_nothing_to_say() -> None:
+    one = np.ones(1)
+    assert [bound.tolist() for bound in shared.room(train(), -np.inf * one, np.inf * one)] == [[-np.inf], [np.inf]]
+    assert shared.smallest_period(train(), 80.0 * one, 79.0 * one, np.inf * one).tolist() == [np.inf]

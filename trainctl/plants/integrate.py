@@ -305,12 +305,17 @@ def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...]) ->
     return Parts(addresses, advance_, exchange_)
 
 
+#: Whose caches on disk name the types of laws, observers and plants.
+KERNELS: tuple[Any, ...] = (stage, see, advance_kernel, exchange_kernel)
+
+
 def from_cache(function: Any, arguments: tuple[Any, ...]) -> Callable[..., None]:
     """Compile for these types, or load what was compiled before."""
     try:
         return function.compile(arguments)  # type: ignore[no-any-return]
-    except (ImportError, AttributeError):  # the cache knows a law that is no longer installed
-        function._cache.flush()
+    except (ImportError, AttributeError):  # a law that is no longer installed, or has changed its names
+        for kernel in KERNELS:
+            kernel._cache.flush()
         return function.compile(arguments)  # type: ignore[no-any-return]
 
 

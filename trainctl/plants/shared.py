@@ -15,6 +15,7 @@ T           control period [s]
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -133,7 +134,8 @@ def room(consists: Consists, lower: Floats, upper: Floats) -> tuple[Floats, Floa
     Returns
     -------
     tuple of ndarray, each of shape (n,)
-        Lower and upper bound of the input, acceleration plus the train's mean running resistance [m/s2].
+        Lower and upper bound of the input, acceleration plus the train's mean running resistance [m/s2]; infinite where the speed
+        is unbounded, since nothing follows then.
 
     Notes
     -----
@@ -141,9 +143,11 @@ def room(consists: Consists, lower: Floats, upper: Floats) -> tuple[Floats, Floa
     least. Where rotating mass or Davis coefficients differ between units, their share of the input does too: it is taken at
     161 speeds of the band.
     """
-    low, high = np.empty(len(lower)), np.empty(len(lower))
-    for i, (a, b) in enumerate(zip(consists.first[:-1], consists.first[1:], strict=True)):
-        speeds = np.linspace(lower[i], upper[i], 161)[:, None]
+    low, high = np.full(len(lower), -np.inf), np.full(len(lower), np.inf)
+    for i, (a, b) in enumerate(pairwise(consists.first)):
+        if not np.isfinite([lower[i], upper[i]]).all():
+            continue
+        speeds = np.linspace(max(lower[i], 0.0), upper[i], 161)[:, None]
         m, rotating = consists.mass[a:b], consists.rotating[a:b]
         r = consists.davis[a:b, 0] + consists.davis[a:b, 1] * speeds + consists.davis[a:b, 2] * speeds**2
         mean = (r @ m / m.sum())[:, None]
@@ -168,13 +172,16 @@ def smallest_period(consists: Consists, speed: Floats, lower: Floats, upper: Flo
     Returns
     -------
     ndarray, shape (n,)
-        T = max((Rho - v_r) / (f - mu), (v_r - rho) / (Mu - F)) [s]; infinite where the units cannot hold the band at all.
+        T = max((Rho - v_r) / (f - mu), (v_r - rho) / (Mu - F)) [s]; infinite where the units cannot hold the band at all, or where
+        the speed is unbounded.
     """
+    banded = np.isfinite(lower) & np.isfinite(upper)
+    lower, upper = np.where(banded, lower, speed), np.where(banded, upper, speed)
     mu, Mu = room(consists, lower, upper)
     f, F = mean_resistance(consists, lower), mean_resistance(consists, upper)
     with np.errstate(divide="ignore", invalid="ignore"):
         period = np.maximum((upper - speed) / (f - mu), (speed - lower) / (Mu - F))
-    return np.where((mu < f) & (Mu > F), period, np.inf)
+    return np.where(banded & (mu < f) & (Mu > F), period, np.inf)
 
 
 def mean_resistance(consists: Consists, speed: Floats) -> Floats:

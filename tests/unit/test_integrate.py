@@ -1,0 +1,268 @@
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trainctl.controllers import emu_finite_time as law
+from trainctl.observers import none
+from trainctl.plants import coupled_units, integrate, shared
+from trainctl.signals import POWERS, Bounds, Consists, Floats, Links, Reference, Scene
+
+JUMP = 0.0137  # s, where the reference below changes its speed: within a sub-step
+
+
+def scene(trains: int = 2, units: int = 3) -> Scene:
+    """Trains of light couplers and no limits, 3000 m apart, behind a leader whose speed jumps."""
+    rows = trains * units
+    one, endless = np.ones(rows), np.full(rows, np.inf)
+    coupled = np.arange(1, rows + 1) % units != 0
+    consists = Consists(
+        np.arange(0, rows + 1, units), 80.0 * one, 8e4 * one, one.copy(), np.tile([0.01176, 7.7616e-4, 1.6e-5], (rows, 1)),
+        1.6e5 * coupled, 600.0 * coupled, endless, endless, endless, endless, endless,
+    )  # fmt: skip
+    pairs = [(j, i) for i in range(trains) for j in (i - 1, i + 1) if 0 <= j < trains]
+    sender, receiver = np.array(pairs, dtype=np.int64).reshape(-1, 2).T.copy()
+    spacing, some = 3000.0 + 80.0 * units, np.ones(len(pairs))
+    links = Links(
+        sender, receiver, np.searchsorted(receiver, np.arange(trains + 1)), (receiver - sender) * spacing, -np.inf * some,
+        np.inf * some, some, some > 0.0, -spacing * np.arange(trains), np.arange(trains),
+    )  # fmt: skip
+    own = np.empty((rows, 2))
+    own[:, 0] = 10e3 - np.repeat(spacing * np.arange(trains), units) - 80.0 * np.tile(np.arange(units), trains)
+    own[:, 1] = 80.0
+    reference = Reference(np.array([0.0, JUMP, 1e4]), np.array([[10e3, 80.0], [10e3 + 80.0 * JUMP, 85.0]]))
+    free = np.full(trains, np.inf)
+    names = [str(i) for i in range(trains)]
+    return Scene(names, consists, own, links, Bounds(-free, free, -free, free), reference, 0.0, 1.0, 1.0, 0.5, 0.01)
+
+
+class Rig:
+    """A closed loop to be advanced."""
+
+    def __init__(self, s: Scene, part: Any, constants: Any, live: bool = True, breaks: tuple[float, ...] = (JUMP,)) -> None:
+        self.scene, self.part = s, part
+        self.own, self.estimate = s.own.copy(), np.zeros((len(s.own), 0))
+        plant = coupled_units.constants(coupled_units.Params(), s.consists)
+        self.loop = integrate.Loop(constants, none.Constants(), plant)
+        self.air = integrate.Air(np.zeros((len(s.links.sender), part.MESSAGE)), live, False, 0.0)
+        self.work = integrate.scratch(self.own, self.estimate, len(s.trains), none.CORRECTIONS, part.MESSAGE)
+        self.extremes = integrate.Extremes.fresh(len(s.trains), len(s.own), len(part.WATCHED))
+        self.breaks = np.array(breaks)
+        self.parts = integrate.compiled(part, none, coupled_units, self._arguments(0.0, 0.01, 1))
+
+    def _arguments(self, t: float, h: float, n: int) -> tuple[Any, ...]:
+        c = self.scene.consists
+        return (
+            self.loop, c.first, c.length, self.scene.links, self.scene.reference, self.air, t, h, n, self.breaks, self.own,
+            self.estimate, self.work, self.extremes,
+        )  # fmt: skip
+
+    def advance(self, t: float, h: float, n: int) -> Floats:
+        return integrate.advance(self.parts, *self._arguments(t, h, n))
+
+    def exchange(self, t: float) -> None:
+        c = self.scene.consists
+        integrate.exchange(
+            self.parts, self.loop, c.first, self.scene.links, self.scene.reference, self.air, t, self.own, self.estimate, self.work
+        )
+
+
+def cruising(**options: Any) -> Rig:
+    """The finite-time law."""
+    s = scene()
+    return Rig(s, law, law.constants(law.Params(), s), **options)
+
+
+def holding(acceleration: float, s: Scene | None = None) -> Rig:
+    """A held acceleration shared out to the units."""
+    s = s or scene()
+    constants = shared.constants(coupled_units.Params(), s.consists)
+    constants.acceleration[:] = acceleration
+    return Rig(s, shared, constants, live=False)
+
+
+def test_a_held_acceleration_moves_the_head_exactly() -> None:
+    """x + v T + a T**2 / 2: theta = 1/2, whatever the sub-steps."""
+    for n, h in ((800, 0.01), (80, 0.1)):
+        rig = holding(0.37)
+        start = rig.own.copy()
+        rig.advance(0.0, h, n)
+        moved = rig.own - start
+        assert moved[:, 0] == pytest.approx(80.0 * 8.0 + 0.5 * 0.37 * 64.0, abs=1e-9)
+        assert moved[:, 1] == pytest.approx(0.37 * 8.0, abs=1e-11)
+
+
+def test_it_is_of_fourth_order() -> None:
+    errors = []
+    for n in (100, 200, 2000):
+        rig = holding(0.0)
+        rig.own[1, 0] += 0.05
+        rig.advance(0.0, 8.0 / n, n)
+        errors.append(rig.own.copy())
+    coarse, fine = (np.abs(e - errors[2]).max() for e in errors[:2])
+    assert np.log2(coarse / fine) == pytest.approx(4.0, abs=0.4)
+
+
+def test_steps_are_split_where_the_reference_jumps() -> None:
+    def after(h: float, n: int, breaks: tuple[float, ...]) -> Floats:
+        rig = cruising(breaks=breaks)
+        rig.advance(0.0, h, n)
+        return rig.own
+
+    exact = after(0.0004, 250, (JUMP,))
+    assert np.abs(after(0.005, 20, (JUMP,)) - exact).max() < 1e-7
+    assert np.abs(after(0.005, 20, ()) - exact).max() > 1e-4
+
+
+def test_a_break_on_the_grid_splits_nothing() -> None:
+    a, b = cruising(breaks=(JUMP,)), cruising(breaks=(JUMP, 0.02, 0.03, 0.05 + 1e-12))
+    a.advance(0.0, 0.01, 10)
+    b.advance(0.0, 0.01, 10)
+    assert np.array_equal(a.own, b.own)
+
+
+def test_two_calls_are_one() -> None:
+    a, b = cruising(), cruising()
+    a.advance(0.0, 0.01, 100)
+    b.advance(0.0, 0.01, 50)
+    b.advance(0.5, 0.01, 50)
+    assert np.abs(a.own - b.own).max() < 1e-11
+
+
+def test_it_returns_the_forces_at_the_beginning() -> None:
+    rig = cruising()
+    s = rig.scene
+    drag = 8e4 * (0.01176 + (7.7616e-4 + 1.6e-5 * 80.0) * 80.0)
+    first = rig.advance(0.0, 0.01, 10)
+    assert first == pytest.approx(np.full(6, drag))  # in formation until the leader jumps
+    kept = first.copy()
+    later = rig.advance(0.1, 0.01, 10)
+    assert np.array_equal(first, kept)
+    assert later[s.consists.first[0]] > drag + 1e3
+
+
+def test_extremes_see_every_sub_step() -> None:
+    rig = cruising()
+    start = rig.own.copy()
+    seen = []
+    for k in range(100):
+        seen.append((rig.own[0, 0] - rig.own[1, 0] - 80.0, rig.advance(0.01 * k, 0.01, 1)[0]))
+    once = cruising()
+    once.advance(0.0, 0.01, 100)
+    e = once.extremes
+    assert e.coupler_max[0] == pytest.approx(max(s for s, _ in seen), abs=1e-9)
+    assert e.coupler_min[0] == pytest.approx(min(s for s, _ in seen), abs=1e-9)
+    assert e.force_max[0] > max(f for _, f in seen) + 1e3  # just after the jump, where the step is split
+    assert max(f for _, f in seen) > seen[-1][1] + 1e3
+    assert np.isinf(e.coupler_max[[2, 5]]).all()  # nothing behind the last unit
+    assert e.watched_min[1, 0] < 3000.0 + 1e-6
+    assert np.isinf(e.watched_min[0, 0])  # nobody ahead of the first: NaN widens nothing
+    assert np.array_equal(start, once.scene.own)
+
+
+def test_energy_is_the_integral_of_the_powers() -> None:
+    rig = holding(0.2)
+    rig.advance(0.0, 0.01, 1000)
+    supplied = dict(zip(POWERS, rig.extremes.energy.sum(axis=0), strict=True))
+    kinetic = 0.5 * 8e4 * 6 * (82.0**2 - 80.0**2)
+    assert supplied["traction"] - supplied["resistance"] == pytest.approx(kinetic, rel=1e-9)
+    assert supplied["braking"] == supplied["damping"] == supplied["gradient"] == supplied["disturbance"] == 0.0
+
+
+def test_time_at_a_limit_is_counted_per_train() -> None:
+    s = scene()
+    traction = s.consists.traction.copy()
+    traction[4] = 5e3
+    rig = holding(0.2, s._replace(consists=s.consists._replace(traction=traction)))
+    rig.advance(0.0, 0.01, 150)
+    assert rig.extremes.limited == pytest.approx([0.0, 1.5])
+    assert rig.extremes.force_max[4] == 5e3
+
+
+def test_held_messages_are_those_of_the_last_exchange() -> None:
+    rig = cruising(live=False)
+    rig.exchange(0.0)
+    message = np.empty((2, law.MESSAGE))
+    for i in range(2):
+        rows = slice(3 * i, 3 * i + 3)
+        table = np.zeros((0, 0))
+        law.message(i, rig.loop.law, np.array([10e3, 80.0, 0.0, 0.0]), 0.0, rig.own[rows], table, table, message[i])
+    assert np.array_equal(rig.work.sent, message)
+    rig.air.heard[:] = rig.work.sent[rig.scene.links.sender]
+    rig.air.heard[:, law.TAIL_SPEED] -= 3.0  # what was heard is not what is
+    rig.own[:3, 1] += 1.0
+    kept = rig.air.heard.copy()
+    applied = rig.advance(0.0, 0.005, 2)
+    assert np.array_equal(rig.air.heard, kept)
+    drag = 8e4 * (0.01176 + (7.7616e-4 + 1.6e-5 * 80.0) * 80.0)
+    assert applied[3] == pytest.approx(drag - 8e4 * 3.0 ** (2 * 0.9 / 1.9))
+
+
+def test_live_messages_are_those_of_this_instant() -> None:
+    rig = cruising()
+    rig.air.heard[:] = np.nan
+    rig.own[:3, 1] += 1.0
+    applied = rig.advance(0.0, 0.005, 1)
+    drag = 8e4 * (0.01176 + (7.7616e-4 + 1.6e-5 * 80.0) * 80.0)
+    assert applied[3] == pytest.approx(drag + 8e4)  # p_4 sig(1)
+    assert np.isfinite(rig.own).all()
+
+
+REPORT = """
+import importlib.util, json, sys
+spec = importlib.util.spec_from_file_location("rig", sys.argv[1])
+rig = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(rig)
+loop = rig.cruising()
+loop.advance(0.0, 0.01, 5)
+if sys.argv[2] == "state":
+    print(json.dumps(loop.own.tolist()))
+else:
+    used = (rig.integrate.advance_kernel, rig.integrate.exchange_kernel, rig.law.demand, rig.coupled_units.rate)
+    print(json.dumps([sum(f.stats.cache_misses.values()) for f in used]))
+"""
+
+
+def elsewhere(what: str, **environment: str) -> Any:
+    """Run ``REPORT`` in a process of its own."""
+    command = [sys.executable, "-c", REPORT, __file__, what]
+    done = subprocess.run(command, env={**os.environ, **environment}, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+def test_interpreted_and_compiled_code_agree() -> None:
+    rig = cruising()
+    rig.advance(0.0, 0.01, 5)
+    assert np.abs(np.array(elsewhere("state", NUMBA_DISABLE_JIT="1")) - rig.own).max() < 1e-11
+
+
+def test_another_process_finds_everything_compiled() -> None:
+    cruising()
+    assert elsewhere("cache") == [0, 0, 0, 0]
+
+
+def test_a_law_that_is_gone_from_the_cache_s_index_does_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Stale:
+        """A dispatcher whose cache cannot be read until it is emptied."""
+
+        def __init__(self) -> None:
+            self._cache = self
+            self.flushed = False
+
+        def flush(self) -> None:
+            self.flushed = True
+
+        def compile(self, arguments: Any) -> Any:
+            if not self.flushed:
+                raise ModuleNotFoundError("No module named 'somebodys_law'")
+            return arguments
+
+    stale = Stale()
+    monkeypatch.setattr(integrate, "KERNELS", (stale,))
+    assert integrate.from_cache(stale, ("types",)) == ("types",)
