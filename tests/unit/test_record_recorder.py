@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -113,6 +114,26 @@ here.record(pathlib.Path({str(killed)!r}), steps=40, cuts=(20,))
     (killed / "run.json").unlink()
     record(killed, start=21, resume=json.loads((tmp_path / "cut.json").read_text()))
     assert contents(killed) == contents(tmp_path / "whole")
+
+
+def test_when_the_disk_is_full_all_but_the_last_segment_is_kept(tmp_path: Path) -> None:
+    """A limit on file sizes stands for the full disk: writing beyond it fails in the same way."""
+    noise = np.random.default_rng(0).random(40_000)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    recorder = Recorder(tmp_path, {"t": {"time_s": "float"}}, group_rows=1000)
+    recorder.write("t", time_s=noise[:5000])
+    recorder.cut()
+    recorder.event(1.0, "kept")
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, before[1]))
+        with pytest.raises(OSError), recorder:  # closing fails, too: that does not hide the first failure
+            recorder.write("t", time_s=noise)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    write_info(tmp_path, about_run("", 1, []))
+    assert np.array_equal(Run(tmp_path).table("t").time_s, noise[:5000])
+    assert [event["kind"] for event in Run(tmp_path).events] == ["kept"]
+    assert not list(tmp_path.rglob("*.open"))
 
 
 def test_wrong_columns_are_refused(tmp_path: Path) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,7 +19,8 @@ from trainctl.record.series import INSTANT, Pairs, Series, pairs, series
 from trainctl.signals import Bools, Floats
 
 
-class Drawn(NamedTuple):
+@dataclass
+class Drawn:
     """A run made ready for drawing."""
 
     run: Run
@@ -27,23 +30,28 @@ class Drawn(NamedTuple):
     units: Series
     width: str  # "single" or "double", see style.WIDTHS_MM
 
+    @cached_property
     def instants(self) -> Floats:
         """All recorded times [s]."""
         time: Floats = np.unique(self.trains.column("time_s"))
         return time
 
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """All trains, in the order of the scenario."""
         known = self.known.trains
         return (*known, *(name for name in self.trains.names if name not in known))
 
+    @cached_property
     def colour(self) -> dict[str, Any]:
         """Colour of each train."""
-        return dict(zip(self.names(), style.colours(len(self.names())), strict=True))
+        return dict(zip(self.names, style.colours(len(self.names)), strict=True))
 
-    def look(self, name: str) -> dict[str, Any]:
-        """Colour and line width of a train."""
-        return {"color": self.colour()[name], "linewidth": style.weights(len(self.names()))[self.names().index(name)]}
+    @cached_property
+    def look(self) -> dict[str, dict[str, Any]]:
+        """Colour and line width of each train."""
+        widths = style.weights(len(self.names))
+        return {name: {"color": self.colour[name], "linewidth": width} for name, width in zip(self.names, widths, strict=True)}
 
 
 def prepare(run: Run, width: str = "double") -> Drawn:
@@ -60,9 +68,9 @@ def positions(drawn: Drawn) -> Figure:
     for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
         relative = position[rows] - (0.0 if reference is None else leader(reference, time[rows])[0])
         for panel, value in zip(axes, (position[rows] / 1000, relative / 1000), strict=False):
-            _in_and_out(panel, time[rows], value, inside[rows], drawn.colour()[name], label)
+            _in_and_out(panel, time[rows], value, inside[rows], drawn.colour[name], label)
     if reference is not None:
-        instants = drawn.instants()
+        instants = drawn.instants
         style.draw(axes[0], instants, leader(reference, instants)[0] / 1000, color="black", linestyle=":", label="reference")
         axes[1].set_ylabel(r"$x_i - x_r$ [km]")
     axes[0].set_ylabel("position [km]")
@@ -124,9 +132,9 @@ def draw_speeds(panel: Axes, drawn: Drawn) -> None:
     time, speed = drawn.trains.column("time_s"), drawn.trains.column("speed_mps")
     style.bound(panel, *_distinct(drawn.known.speed_mps.values()))
     for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
-        style.draw(panel, time[rows], speed[rows], label=label, **drawn.look(name))
+        style.draw(panel, time[rows], speed[rows], label=label, **drawn.look[name])
     if drawn.known.reference is not None:
-        instants = drawn.instants()
+        instants = drawn.instants
         reference = leader(drawn.known.reference, instants)[1]
         style.draw(panel, instants, reference, color="black", linestyle=":", label="reference", zorder=3)
     panel.set_ylabel("speed [m/s]")
@@ -145,7 +153,7 @@ def draw_inputs(panel: Axes, drawn: Drawn) -> None:
     time, applied = drawn.trains.column("time_s"), drawn.trains.column("input_mps2")
     style.bound(panel, *_distinct(drawn.known.input_mps2.values()))
     for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
-        style.draw(panel, time[rows], applied[rows], label=label, drawstyle="steps-post", **drawn.look(name))
+        style.draw(panel, time[rows], applied[rows], label=label, drawstyle="steps-post", **drawn.look[name])
     panel.set_ylabel(r"input [m/s$^2$]")
 
 
@@ -173,12 +181,12 @@ def train_graph(drawn: Drawn) -> Figure:
         for panel, value in zip(axes, (absolute, relative), strict=False):
             for begin, end in zip([0, *cuts], [*cuts, len(at)], strict=True):
                 line = style.TRACK_STYLES[tracks.index(on[begin]) % len(style.TRACK_STYLES)]
-                style.draw(panel, at[begin : end + 1], value[begin : end + 1], color=drawn.colour()[name], linestyle=line)
-            panel.plot(at[cuts], value[cuts], linestyle="none", marker="o", markersize=4, color=drawn.colour()[name], zorder=4)
+                style.draw(panel, at[begin : end + 1], value[begin : end + 1], color=drawn.colour[name], linestyle=line)
+            panel.plot(at[cuts], value[cuts], linestyle="none", marker="o", markersize=4, color=drawn.colour[name], zorder=4)
             for k in cuts if panel is axes[-1] else ():
                 panel.annotate(
                     f"{on[k - 1]}→{on[k]}", (at[k], value[k]), xytext=(6, 0), textcoords="offset points", fontsize=6.5,
-                    va="center", color=drawn.colour()[name], zorder=5, bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6},
+                    va="center", color=drawn.colour[name], zorder=5, bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6},
                 )  # fmt: skip
     for event in drawn.run.events:
         if event["kind"] in ("topology", "reroute", "join", "leave", "fault", "limit") and event["time_s"] > time.min():
@@ -188,9 +196,9 @@ def train_graph(drawn: Drawn) -> Figure:
     if reference is not None:
         axes[1].set_ylabel(r"$x_i - x_r$ [km]")
     axes[-1].set_xlabel("time [s]")
-    axes[-1].set_xlim(drawn.instants()[0], drawn.instants()[-1])
+    axes[-1].set_xlim(drawn.instants[0], drawn.instants[-1])
     handles = [
-        Line2D([], [], color=drawn.colour()[name], label=label)
+        Line2D([], [], color=drawn.colour[name], label=label)
         for name, label in zip(drawn.trains.names, style.labels(drawn.trains.names, "train "), strict=True)
         if not label.startswith("_")
     ]
@@ -209,9 +217,9 @@ def speed_over_position(drawn: Drawn) -> Figure:
     figure, axes = style.panels(1, drawn.width, 52.0)
     position, speed = drawn.trains.column("position_m") / 1000, drawn.trains.column("speed_mps")
     for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
-        axes[0].plot(*style.envelope(position[rows], speed[rows]), label=label, **drawn.look(name))
+        axes[0].plot(*style.envelope(position[rows], speed[rows]), label=label, **drawn.look[name])
     if drawn.known.reference is not None:
-        where, reference = leader(drawn.known.reference, drawn.instants())
+        where, reference = leader(drawn.known.reference, drawn.instants)
         axes[0].plot(where / 1000, reference, color="black", linestyle=":", label="reference", zorder=3)
     axes[0].set_xlabel("position [km]")
     axes[0].set_ylabel("speed [m/s]")
@@ -225,7 +233,7 @@ def gaps(drawn: Drawn) -> Figure:
     time, gap = drawn.trains.column("time_s"), drawn.trains.column("gap_m") / 1000
     for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
         if np.isfinite(gap[rows]).any():
-            style.draw(axes[0], time[rows], gap[rows], label=f"{label} to the one ahead", **drawn.look(name))
+            style.draw(axes[0], time[rows], gap[rows], label=f"{label} to the one ahead", **drawn.look[name])
     wanted, least = set(), set()
     for (ahead, _), (_, rows) in zip(drawn.links.ends, drawn.links.slices(), strict=True):
         length = sum(drawn.known.length_m.get(ahead, (0.0,)))
@@ -259,7 +267,7 @@ def comparison(runs: Sequence[Run], names: Sequence[str], width: str = "double")
 
 def _finish(figure: Figure, axes: Sequence[Axes], drawn: Drawn) -> None:
     axes[-1].set_xlabel("time [s]")
-    axes[-1].set_xlim(drawn.instants()[0], drawn.instants()[-1])
+    axes[-1].set_xlim(drawn.instants[0], drawn.instants[-1])
     style.legend(figure, drawn.width)
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from trainctl.record import style
+from trainctl.record.facts import leader
 from trainctl.record.figures_trains import Drawn
 from trainctl.record.values import at_least, at_most
 from trainctl.signals import Floats
@@ -64,17 +66,18 @@ def position_differences(drawn: Drawn) -> Figure:
     figure, axes = style.panels(2, drawn.width)
     _between_trains(axes[0], drawn, "position_m", 1000.0)
     shift = {name: sum(length[:-1]) for name, length in drawn.known.length_m.items()}
-    for kind, look in (("desired_m", {"color": "black", "linestyle": ":", "label": "desired"}), ("lower_m", {}), ("upper_m", {})):
+    desired: dict[str, Any] = {"color": "black", "linestyle": ":", "label": "desired"}
+    for kind in ("desired_m", "lower_m", "upper_m"):
         values = {
             float(value) - shift.get(ahead, 0.0)
             for (ahead, _), (_, rows) in zip(drawn.links.ends, drawn.links.slices(), strict=True)
             for value in np.unique(drawn.links.column(kind)[rows])
         }
         if len(values) <= 4:
-            style.bound(axes[0], *(value / 1000 for value in values), **look)  # type: ignore[arg-type]
-    axes[0].set_ylabel("trains [km]")
+            style.bound(axes[0], *(value / 1000 for value in values), **(desired if kind == "desired_m" else {}))
+    axes[0].set_ylabel("between trains [km]")
     _between_units(axes[1], drawn, "position_m")
-    axes[1].set_ylabel("units [m]")
+    axes[1].set_ylabel("between units [m]")
     return _finished(figure, axes, drawn)
 
 
@@ -84,9 +87,9 @@ def speed_differences(drawn: Drawn) -> Figure:
     _between_trains(axes[0], drawn, "speed_mps", 1.0)
     stated = [drawn.known.controller.get(f"speed_error_{side}_mps") for side in ("lower", "upper")]
     style.bound(axes[0], *(float(value) for value in stated if isinstance(value, int | float)))
-    axes[0].set_ylabel("trains [m/s]")
+    axes[0].set_ylabel("between trains [m/s]")
     _between_units(axes[1], drawn, "speed_mps")
-    axes[1].set_ylabel("units [m/s]")
+    axes[1].set_ylabel("between units [m/s]")
     return _finished(figure, axes, drawn)
 
 
@@ -115,7 +118,7 @@ def estimates(quantity: str, label: str) -> Callable[[Drawn], Figure]:
         style.draw(axes[0], time[rows], guess[rows], **options)
         axes[0].set_ylabel(label)
         _bands(axes[1], drawn, guess - true, guess - true, guess - true, "unit ")
-        axes[1].set_ylabel("error, all units")
+        axes[1].set_ylabel("error [" + label.partition("[")[2])
         return _finished(figure, axes, drawn)
 
     figure_of.__doc__ = f"True {quantity} and its estimate of one unit; error of the estimate of all units."
@@ -129,7 +132,7 @@ def _bands(panel: Axes, drawn: Drawn, value: Floats, low: Floats, high: Floats, 
         if not np.isfinite(value[rows]).any():
             continue
         train, _, unit = name.rpartition(".")
-        colour = drawn.colour()[train]
+        colour = drawn.colour[train]
         label = f"{what}s of train {train}".replace(" s ", "s ") if train not in shown else f"_{name}"
         shown.add(train)
         if np.any(low[rows] < high[rows]):
@@ -149,13 +152,11 @@ def _floor(x: Floats, y: Floats, sign: float) -> tuple[Floats, Floats]:
 
 
 def _over_time(drawn: Drawn, column: str, label: str, scale: float, derivative: int) -> Figure:
-    from trainctl.record.facts import leader
-
     figure, axes = style.panels(1, drawn.width, 52.0)
     value = drawn.units.column(column) / scale
     _bands(axes[0], drawn, value, value, value, "unit ")
     if drawn.known.reference is not None:
-        instants = drawn.instants()
+        instants = drawn.instants
         reference = leader(drawn.known.reference, instants)[derivative] / scale
         style.draw(axes[0], instants, reference, color="black", linestyle=":", label="reference", zorder=3)
     axes[0].set_ylabel(label)
@@ -167,12 +168,14 @@ def _between_trains(panel: Axes, drawn: Drawn, column: str, scale: float) -> Non
     rows = dict(drawn.units.slices())
     tails: dict[str, str] = {name.rpartition(".")[0]: name for name in rows}  # units are in order: the last one stays
     value, time = drawn.units.column(column), drawn.units.column("time_s")
-    for ahead, behind in drawn.links.ends:
+    count, palette = len(drawn.names), style.COLOURS
+    for k, (ahead, behind) in enumerate(drawn.links.ends):
         if ahead in tails and f"{behind}.1" in rows:
             tail, head = rows[tails[ahead]], rows[f"{behind}.1"]
             _, a, b = np.intersect1d(time[tail], time[head], return_indices=True)
-            style.draw(panel, time[head][b], (value[tail][a] - value[head][b]) / scale, color=drawn.colour()[behind],
-                       label=f"train {ahead} to {behind}")  # fmt: skip
+            difference = (value[tail][a] - value[head][b]) / scale
+            colour = palette[(count + k) % len(palette)]  # not those of the trains, which stand for their units
+            style.draw(panel, time[head][b], difference, color=colour, label=f"trains {ahead}-{behind}")
 
 
 def _between_units(panel: Axes, drawn: Drawn, column: str) -> None:
@@ -187,6 +190,6 @@ def _between_units(panel: Axes, drawn: Drawn, column: str) -> None:
 
 def _finished(figure: Figure, axes: list[Axes], drawn: Drawn) -> Figure:
     axes[-1].set_xlabel("time [s]")
-    axes[-1].set_xlim(drawn.instants()[0], drawn.instants()[-1])
+    axes[-1].set_xlim(drawn.instants[0], drawn.instants[-1])
     style.legend(figure, drawn.width)
     return figure

@@ -12,17 +12,19 @@ In short::
     finish(out)                                              # DIR.partial -> DIR
 
 Until ``close`` the rows lie in closed segments (``segments/trains-00000.parquet``), because a Parquet file that was not closed
-cannot be read: a killed run keeps all but its last segment. The final files do not depend on where the segments were cut.
+cannot be read: a run that is killed, or whose disk is full, keeps all but its last segment. ``recorder.cut()`` begins a new one
+at any time (say every ten seconds of wall time); the final files do not depend on where the segments were cut.
 """
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import pyarrow as pa
@@ -131,7 +133,8 @@ class Recorder:
             name: _Segments(self._segments, name, columns, dict(metadata or {}), group_rows, segment_groups, kept.get(name, 0))
             for name, columns in tables.items()
         }
-        self._events: IO[bytes] = open(folder / "events.jsonl", "r+b" if resume else "wb")  # noqa: SIM115  closed by close()
+        # unbuffered: a line that did not fit on the disk must not come back when the file is closed
+        self._events = open(folder / "events.jsonl", "r+b" if resume else "wb", buffering=0)  # noqa: SIM115  closed by close()
         if resume:
             self._events.truncate(resume["events_bytes"])
             self._events.seek(0, os.SEEK_END)
@@ -142,15 +145,14 @@ class Recorder:
 
     def event(self, time_s: float, kind: str, **fields: Any) -> None:
         """Append a line to events.jsonl, at once."""
-        line = json.dumps(plain({"time_s": time_s, "kind": kind, **fields}), separators=(",", ":"))
-        self._events.write(line.encode() + b"\n")
-        self._events.flush()
+        line = json.dumps(plain({"time_s": time_s, "kind": kind, **fields}), separators=(",", ":")).encode() + b"\n"
+        if self._events.write(line) < len(line):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.folder / "events.jsonl"))
 
     def cut(self) -> dict[str, Any]:
         """Close the segments, so that all rows until now survive a kill. Returns what ``resume`` needs (plain JSON)."""
         for table in self._tables.values():
             table.cut()
-        self._events.flush()
         os.fsync(self._events.fileno())
         return {"segments": {name: t.count for name, t in self._tables.items()}, "events_bytes": self._events.tell()}
 
@@ -195,37 +197,54 @@ class _Segments:
     def path(self, number: int) -> Path:
         return self.folder / f"{self.name}-{number:05d}.parquet"
 
+    def open_path(self) -> Path:
+        return self.path(self.count).with_suffix(".open")
+
     def append(self, values: Mapping[str, ArrayLike]) -> None:
-        if self.stream is None:
-            self.stream = _Stream(self.path(self.count).with_suffix(".open"), self.columns, self.metadata, self.group_rows)
-        self.stream.append(values)
+        try:
+            if self.stream is None:
+                self.stream = _Stream(self.open_path(), self.columns, self.metadata, self.group_rows)
+            self.stream.append(values)
+        except OSError:
+            self.drop()
+            raise
         if self.stream.rows >= self.segment_rows:
             self.cut()
 
     def cut(self) -> None:
         if self.stream is None:
             return
-        stream, self.stream = self.stream, None
-        stream.close()
-        os.replace(stream.path, self.path(self.count))
+        try:
+            self.stream.close()
+        except OSError:
+            self.drop()
+            raise
+        self.stream = None
+        os.replace(self.open_path(), self.path(self.count))
         self.count += 1
+
+    def drop(self) -> None:
+        """Give up the segment being written: without its end it cannot be read, and its room on the disk is needed."""
+        self.stream = None
+        remove(self.open_path())
 
     def join(self, target: Path) -> None:
         """One file of full row groups out of all segments, the same bytes wherever they were cut."""
         if self.count == 1:  # its groups are full already
             os.replace(self.path(0), target)
             return
-        stream = _Stream(target.with_suffix(".open"), self.columns, self.metadata, self.group_rows)
+        unfinished = target.with_suffix(".open")
         try:
+            stream = _Stream(unfinished, self.columns, self.metadata, self.group_rows)
             for number in range(self.count):
                 with pq.ParquetFile(self.path(number)) as file:
                     for group in range(file.num_row_groups):
                         stream.append(self.values(file.read_row_group(group)))
             stream.close()
         except OSError:
-            remove(stream.path)
+            remove(unfinished)
             raise
-        os.replace(stream.path, target)
+        os.replace(unfinished, target)
 
     def values(self, table: pa.Table) -> dict[str, NDArray[Any]]:
         """Back from Arrow to what ``append`` takes."""

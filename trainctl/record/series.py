@@ -82,8 +82,10 @@ def pairs(links: pd.DataFrame) -> Pairs:
         return Pairs([], np.zeros(1, dtype=np.int64), links)
     flip = links["desired_m"].to_numpy() < 0
     sign = np.where(flip, -1.0, 1.0)
-    ends = pd.Categorical(pd.concat([links["sender"].astype(str), links["receiver"].astype(str)]))
-    names, (sender, receiver) = list(ends.categories), ends.codes.astype(np.int64).reshape(2, -1)
+    ends = [links[key].astype("category").cat for key in ("sender", "receiver")]
+    names = sorted({str(text) for end in ends for text in end.categories})
+    place = {text: code for code, text in enumerate(names)}
+    sender, receiver = (np.array([place[str(text)] for text in end.categories])[end.codes.to_numpy()] for end in ends)
     lower, upper = links["lower_m"].to_numpy(), links["upper_m"].to_numpy()
     frame = pd.DataFrame({
         "time_s": links["time_s"].to_numpy(),

@@ -20,19 +20,20 @@ from trainctl.signals import Floats
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C7A00")
 GREY = "#777777"
 #: Line style per track, in the order of their names.
-TRACK_STYLES = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (5, 1.5, 1.2, 1.5)))
+TRACK_STYLES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (5, 1.5, 1.2, 1.5)))
 
 #: Column width and double width of a page in print [mm].
 WIDTHS_MM = {"single": 85.0, "double": 178.0}
 #: Points drawn per line at most; beyond, each stretch is drawn by its least and greatest value.
 POINTS = 2000
+CROWD = 50  # lines
 #: More lines than this are coloured by a scale, and only some of them named.
 NAMED = len(COLOURS)
 
 #: Resolution of bitmaps [1/inch].
 DPI = 300
 
-SETTINGS = {
+SETTINGS: Any = {
     "font.size": 8.0, "axes.labelsize": 8.0, "axes.titlesize": 8.0, "legend.fontsize": 7.0, "xtick.labelsize": 7.0,
     "ytick.labelsize": 7.0, "lines.linewidth": 1.0, "axes.linewidth": 0.6, "axes.grid": True, "grid.linewidth": 0.3,
     "grid.color": "#cccccc", "axes.axisbelow": True, "axes.spines.top": False, "axes.spines.right": False,
@@ -100,7 +101,8 @@ def labels(names: Sequence[str], what: str = "") -> list[str]:
 
 def draw(axes: Axes, x: Floats, y: Floats, **options: Any) -> None:
     """Draw a line, broken where the log has gaps, and downsampled so that every extreme stays."""
-    x, y = envelope(*broken(np.asarray(x, float), np.asarray(y, float)))
+    points = POINTS if len(axes.lines) < CROWD else POINTS // 8  # no one tells single lines of a crowd apart
+    x, y = envelope(*broken(np.asarray(x, float), np.asarray(y, float)), points)
     axes.plot(x, y, **options)
 
 
@@ -137,7 +139,8 @@ def bound(axes: Axes, *values: float, label: str = "bound", **options: Any) -> N
     """Dashed lines at the finite ones of some values."""
     for value in values:
         if np.isfinite(value):
-            axes.axhline(value, **{"color": GREY, "linestyle": (0, (5, 2)), "linewidth": 0.9, "label": label} | options)
+            look: dict[str, Any] = {"color": GREY, "linestyle": (0, (5, 2)), "linewidth": 0.9, "label": label}
+            axes.axhline(value, **(look | options))
 
 
 def room(axes: Axes, least: float) -> None:
