@@ -100,10 +100,10 @@ def test_a_held_acceleration_moves_the_head_exactly() -> None:
 
 def test_it_is_of_fourth_order() -> None:
     errors = []
-    for n in (100, 200, 2000):
+    for n in (10, 20, 400):
         rig = holding(0.0)
         rig.own[1, 0] += 0.05
-        rig.advance(0.0, 8.0 / n, n)
+        rig.advance(0.0, 1.0 / n, n)
         errors.append(rig.own.copy())
     coarse, fine = (np.abs(e - errors[2]).max() for e in errors[:2])
     assert np.log2(coarse / fine) == pytest.approx(4.0, abs=0.4)
