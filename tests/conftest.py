@@ -13,7 +13,7 @@ settings.load_profile("suite")
 
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
-    """Run a scenario once per session and hand out its run folder: finished("three_tracks", "numeric", **{"run.duration_s": 60})."""
+    """Run a scenario once per session: finished("three_tracks", "numeric", **{"run.duration_s": 60}) is its run folder."""
     from trainctl.prepare import open_scenario
     from trainctl.record.run import Run
     from trainctl.runner import run

@@ -1,7 +1,7 @@
 """Write the generated parts of scenarios/README.md: keys of laws, plants and observers, and the list of metrics.
 
-    python tools/reference_pages.py          # rewrite the page
-    python tools/reference_pages.py --check  # exit 1 if it is out of date
+python tools/reference_pages.py          # rewrite the page
+python tools/reference_pages.py --check  # exit 1 if it is out of date
 """
 
 from __future__ import annotations

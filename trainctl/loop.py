@@ -62,9 +62,7 @@ class Simulation:
             prepared.scenario.disturbance, prepared.scenario.ids, run.step_s, run.seed, getattr(prepared.law, "worst", None)
         )
         period = top.communication_period_s or run.control_period_s or run.step_s
-        self.exchange = Exchange(
-            loss=top.loss, delay=round(top.delay_s / period), radius=top.range_m or np.inf, seed=run.seed or 0
-        )
+        self.exchange = Exchange(loss=top.loss, delay=round(top.delay_s / period), radius=top.range_m or np.inf, seed=run.seed or 0)
         self.motion: Points | Units = Points(prepared) if prepared.scenario.plant.kind == "point" else Units(prepared)
         self.demand = Demand(np.zeros(n), np.zeros(n, bool))
         self.alarms = monitor.Alarms()

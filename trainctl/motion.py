@@ -11,7 +11,7 @@ import numpy as np
 from trainctl.plants import actuated_units, coupled_units, faults, integrate, point, shared
 from trainctl.plants.disturbance import Disturbed
 from trainctl.prepare import Prepared
-from trainctl.signals import GRAVITY, POSITION, SPEED, Bools, Demand, Floats, Links, Scene
+from trainctl.signals import FORCE, GRAVITY, POSITION, POWERS, SPEED, Bools, Demand, Floats, Links, Scene
 from trainctl.topology.exchange import Exchange
 
 
@@ -23,6 +23,7 @@ class Motion(NamedTuple):
     limited: Bools  # (n,) a limit of the plant acted
     clipped: Bools  # (n,) the train would have moved backwards
     force: Floats | None  # (U,) N at the beginning of the step
+    extras: dict[str, Floats]  # further columns of the units, (U,) each
 
 
 class Points:
@@ -43,7 +44,7 @@ class Points:
         constants = self.constants._replace(resistance_factor=disturbed.resistance)
         kick = point.Kick(disturbed.position, disturbed.speed, disturbed.input)
         moved = point.advance(constants, own, demand.acceleration, self.step, kick)
-        return moved.own, Motion(moved.displacement, moved.input, moved.limited, moved.clipped, None)
+        return moved.own, Motion(moved.displacement, moved.input, moved.limited, moved.clipped, None, {})
 
 
 class Units:
@@ -123,8 +124,8 @@ class Units:
         self._disturb(disturbed)
         moved = own.copy()
         moved[:, SPEED] += np.repeat(disturbed.speed, np.diff(first))
-        limited = self.extremes.limited.copy()
-        force = None
+        limited, estimate = self.extremes.limited.copy(), self.estimate.copy()
+        demanded = None
         for begin, sub_steps in self._pieces(t):
             self._exchange(begin, moved, links, exchange)
             self._make_noise(begin)
@@ -132,8 +133,10 @@ class Units:
                 self.parts, self.loop, first, p.consists.length, links, p.reference, self.air, begin, self.h, sub_steps, self.breaks,
                 moved, self.estimate, self.work, self.extremes,
             )  # fmt: skip
-            force = applied if force is None else force
-        assert force is not None
+            demanded = applied if demanded is None else demanded
+        assert demanded is not None
+        extras = self._extras(t, own, estimate, demanded)
+        force = own[:, FORCE].copy() if p.plant.STATES > FORCE else demanded
         displacement = moved[heads, POSITION] - own[heads, POSITION] + disturbed.position
         clipped = displacement < 0.0
         displacement[clipped] = 0.0
@@ -141,8 +144,24 @@ class Units:
         moved[:, POSITION] += shift
         return moved, Motion(
             displacement=displacement, input=np.add.reduceat(force, heads) / self.masses,
-            limited=self.extremes.limited > limited, clipped=clipped, force=force,
+            limited=self.extremes.limited > limited, clipped=clipped, force=force, extras=extras,
         )  # fmt: skip
+
+    def _extras(self, t: float, own: Floats, estimate: Floats, demanded: Floats) -> dict[str, Floats]:
+        """What actuators, faults and observers do at ``t``, for the log."""
+        if self.p.plant.STATES <= FORCE:
+            return {}
+        rate, power = np.empty_like(own), np.empty(len(POWERS))
+        for i in range(len(self.masses)):
+            rows = slice(self.p.consists.first[i], self.p.consists.first[i + 1])
+            self.p.plant.rate(i, self.plant, t, t, own[rows], demanded[rows], rate[rows], power)
+        return {
+            "law_input": demanded,
+            "fault_mps3": actuated_units.fault(self.plant, t, demanded),
+            "fault_estimate_mps3": self.p.observer.fault_estimate(self.loop.observer, estimate),
+            "acceleration_mps2": rate[:, SPEED],
+            "acceleration_estimate_mps2": estimate[:, self.p.law.W],
+        }
 
     def _pieces(self, t: float) -> list[tuple[float, int]]:
         """(start, sub-steps) of the stretches of one simulator step within which messages and noise are held."""

@@ -197,7 +197,8 @@ class ContinuousLaw(Protocol):
         correction: Floats, desired: Floats, heard: Floats, out: Floats,
     ) -> None:  # fmt: skip
         """Write the demanded force of each unit [N] into ``out``. ``desired`` (k,) and ``heard`` (k, w) are the rows of the k
-        links train ``i`` hears on; ``age`` [s] is how old ``heard`` is (0 in the exact mode)."""
+        links train ``i`` hears on; ``age`` [s] is how old ``heard`` is (0 in the exact mode).
+        """
 
     def message(
         self, i: int, constants: Any, leader: Floats, slot: float, own: Floats, estimate: Floats, estimate_rate: Floats, out: Floats
@@ -236,7 +237,8 @@ class Plant(Protocol):
         self, i: int, constants: Any, t: float, inside: float, own: Floats, applied: Floats, out: Floats, power: Floats
     ) -> None:
         """Write d(own)/dt into ``out`` and the train's powers [W] into ``power`` (6,): see ``POWERS``. ``inside`` is a time
-        within the piece meant where something jumps at ``t``."""
+        within the piece meant where something jumps at ``t``.
+        """
 
 
 #: What ``Plant.rate`` writes into ``power``; each is the rate of an energy [W]. Kinetic plus coupler energy changes by

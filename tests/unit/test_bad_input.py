@@ -133,7 +133,13 @@ def test_all_mistakes_come_at_once(typed, tmp_path):
     (tmp_path / "mistaken.toml").write_text(text)
     code, lines = typed("check", "mistaken.toml")
     assert code == 2
-    for key in ("run.duration_s = long", "run.dt:", "bounds.speed_upper_mps = 85", "train[3].position_m = -5", "event[1].crossover"):
+    for key in (
+        "run.duration_s = long",
+        "run.dt:",
+        "bounds.speed_upper_mps = 85",
+        "train[3].position_m = -5",
+        "event[1].crossover",
+    ):
         assert sum(f"mistaken.toml: {key}" in line for line in lines) == 1, lines
     assert not any("speed_upper_mps = inf" in line for line in lines), "what follows from a mistake is not another one"
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from trainctl.record.recorder import ENERGIES, Recorder, standard_tables
+from trainctl.record.recorder import ENERGIES, UNIT_EXTRAS, Recorder, standard_tables
 from trainctl.signals import POSITION, SPEED, Bools, Floats, Ints, Links
 
 if TYPE_CHECKING:
@@ -41,9 +41,10 @@ class Journal:
         self.has_units = p.scenario.plant.kind != "point"
         watched = tuple(getattr(p.law, "WATCHED", ())) if self.has_units and not p.sampled else ()
         self.watched = watched
+        self.extras = UNIT_EXTRAS if p.scenario.plant.kind == "actuated_units" else ()
         tables = standard_tables(
             p.scenario.ids, p.line.track_ids, p.line.edges, units=self.has_units, watched=watched,
-            train_extras=ENERGIES if self.has_units else (),
+            train_extras=ENERGIES if self.has_units else (), unit_extras=self.extras,
         )  # fmt: skip
         self.recorder = Recorder(folder, tables)
         self.train_of_unit = np.repeat(np.arange(len(p.scenario.train)), np.diff(p.consists.first))
@@ -92,6 +93,7 @@ class Journal:
             force_n=force, coupler_m=stretch, coupler_force_n=p.consists.stiffness * stretch + p.consists.damping * rate,
             coupler_min_m=_widened(np.fmin, x.coupler_min, stretch), coupler_max_m=_widened(np.fmax, x.coupler_max, stretch),
             force_min_n=_widened(np.fmin, x.force_min, force), force_max_n=_widened(np.fmax, x.force_max, force),
+            **(row.motion.extras if row.motion is not None else dict.fromkeys(self.extras, missing)),
         )  # fmt: skip
         columns = {f"{name}_min": _finite(x.watched_min[:, q]) for q, name in enumerate(self.watched)}
         columns |= {f"{name}_max": _finite(x.watched_max[:, q]) for q, name in enumerate(self.watched)}
