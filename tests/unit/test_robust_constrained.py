@@ -241,11 +241,11 @@ def test_resistance_and_measurement_count_in_the_l1_bound() -> None:
     assert worst(on="measurement", amplitude_m=1.0) > 1.0
 
 
-def test_l1_bound_is_the_plain_sum_over_impulse_responses() -> None:
-    """Long-hand: one impulse at a time through the unsaturated map (9)."""
+def test_l1_bounds_are_the_plain_sums_over_impulse_responses() -> None:
+    """Long-hand, one impulse at a time through the unsaturated map (9): error of the ends, speeds and inputs."""
     start, T = scene(), 0.8
     big = robust_gain.laplacian(4, start.links)
-    total = 0.0
+    error, speed, asked = 0.0, np.zeros(4), np.full(4, 0.01)  # w3 itself is part of the input
     for channel, size in ((0, 0.1), (1, 0.2), (2, 0.01)):
         for i in range(4):
             p, v = np.zeros(4), np.zeros(4)
@@ -254,27 +254,35 @@ def test_l1_bound_is_the_plain_sum_over_impulse_responses() -> None:
             else:
                 v[i] = size if channel == 1 else size * T
             for _ in range(2000):
-                total += abs(p[0] - p[3])
-                p, v = p + v * T, v + (-0.3 * v - big @ p) * T
-    amplitude = np.zeros((4, 4))
-    amplitude[0], amplitude[1], amplitude[2] = 0.1, 0.2, 0.01
-    closed = robust_gain.loop(np.full(4, 0.3), start)
-    bound, tail = robust_gain.l1_gain(closed, robust_gain.pair_row(4, 0, 3)[None], amplitude)
-    assert total <= bound[0] <= total * (1 + 1e-6)
-    assert 0.0 < tail[0] < 1e-6 * total
+                u = -0.3 * v - big @ p
+                error, speed, asked = error + abs(p[0] - p[3]), speed + abs(v), asked + abs(u)
+                p, v = p + v * T, v + u * T
+    amplitude = np.zeros((5, 4))
+    amplitude[:3] = [[0.1] * 4, [0.2] * 4, [0.01] * 4]
+    h = np.full(4, 0.3)
+    bound, tail = robust_gain.l1_gain(robust_gain.loop(h, start), robust_gain.pair_row(4, 0, 3)[None], amplitude[[0, 1, 2, 4]])
+    assert error <= bound[0] <= error * (1 + 1e-6)
+    assert 0.0 < tail[0] < 1e-6 * error
+    gain = robust_gain.gain(h, start, amplitude)
+    assert gain.worst_m == pytest.approx(bound[0], rel=1e-12)
+    assert gain.speed_mps == pytest.approx(speed.max(), rel=2e-6)
+    assert gain.input_mps2 == pytest.approx(asked.max(), rel=2e-6)
+    assert gain.unsaturated
+    assert not robust_gain.gain(h, start, 6 * amplitude).unsaturated
 
 
 @pytest.mark.parametrize("steps", [1, 3])
 def test_loop_matrices_are_those_of_a_held_acceleration(steps: int) -> None:
     """A plant that integrates exactly: theta = 1/2 whatever the number of steps."""
-    start = scene(step=0.8 / steps, lead=0.5)
+    start, T = scene(step=0.8 / steps, lead=0.5), 0.8 / steps
     closed = robust_gain.loop(np.full(4, 0.3), start)
     rng = np.random.default_rng(1)
-    p, v = rng.normal(size=4), rng.normal(size=4)
+    p, v, w = rng.normal(size=4), rng.normal(size=4), rng.normal(size=(3, 4))
+    measured = rng.normal(size=4)
     x = np.concatenate((p[1:] - p[0], v, np.zeros(4)))
-    u = -0.3 * v - robust_gain.laplacian(4, start.links) @ p
-    x = closed.law @ x
-    for _ in range(steps - 1):
-        x = closed.hold @ x
-    p, v = p + 0.8 * v + 0.32 * u, v + 0.8 * u
+    u = -0.3 * v - robust_gain.laplacian(4, start.links) @ (p + measured)
+    for k in range(steps):
+        x = (closed.hold if k else closed.law) @ x + closed.kick @ w.reshape(-1) + (0.0 if k else closed.noise @ measured)
+        change = u * T + w[1] + w[2] * T
+        p, v = p + v * T + 0.5 * change * T + w[0], v + change
     np.testing.assert_allclose(x, np.concatenate((p[1:] - p[0], v, u)), atol=1e-12)
