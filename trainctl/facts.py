@@ -34,6 +34,6 @@ def facts(p: Prepared) -> dict[str, Any]:
             found["input_room_mps2"] = [round(float(p.bounds.input_lower.max()), 6), round(float(p.bounds.input_upper.min()), 6)]
     else:
         found["sub_step_s"] = scene.sub_step
-    found["warnings"] = list(p.law.warnings(p.params, scene)) if hasattr(p.law, "warnings") else []
+    found["warnings"] = list(p.law.warnings(p.params, scene, p.start_track)) if hasattr(p.law, "warnings") else []
     found["report"] = list(p.law.report(p.params, scene, p.scenario.disturbance)) if hasattr(p.law, "report") else []
     return found

@@ -59,7 +59,7 @@ class Simulation:
         self.ahead: Ints = np.full(n, -1)
         self.pending = sorted(enumerate(prepared.scenario.event, 1), key=lambda e: e[1].time_s)
         self.signals = disturbance.prepare(
-            prepared.scenario.disturbance, prepared.scenario.ids, run.step_s, run.seed, getattr(prepared.law, "worst", None)
+            prepared.scenario.disturbance, prepared.scenario.ids, run.step_s, run.seed, prepared.worst
         )
         period = top.communication_period_s or run.control_period_s or run.step_s
         self.exchange = Exchange(loss=top.loss, delay=round(top.delay_s / period), radius=top.range_m or np.inf, seed=run.seed or 0)

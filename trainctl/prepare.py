@@ -9,7 +9,7 @@ import math
 import pkgutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -84,6 +84,12 @@ class Prepared:
     def first_scene(self) -> Scene:
         """The scene at time 0."""
         return self.scene(self.own, self.first_links, 0.0)
+
+    @property
+    def worst(self) -> disturbance.Worst | None:
+        """The law's own worst disturbance of a pair of trains, if it knows one."""
+        function = getattr(self.law, "worst", None)
+        return None if function is None else partial(function, self.params, self.first_scene)
 
     def leader(self, t: float) -> Floats:
         """Position, speed, acceleration and jerk of the reference at ``t``, shape (4,)."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trainctl.signals import Floats
+from trainctl.signals import Floats, Ints
 
 if TYPE_CHECKING:
     from trainctl.prepare import Prepared
@@ -23,6 +23,7 @@ class Alarms:
     """Which bounds have been broken so far, and how often (steps)."""
 
     count: dict[tuple[str, str], int] = field(default_factory=dict)
+    order: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
     def total(self) -> int:
@@ -39,6 +40,7 @@ class Alarms:
             u = row.motion.input
             yield from self._per_train("input_lower_mps2", u, bounds.input_lower, u < bounds.input_lower - ROUNDING, ids)
             yield from self._per_train("input_upper_mps2", u, bounds.input_upper, u > bounds.input_upper + ROUNDING, ids)
+        yield from self._collisions(p, row)
         spacing = row.seen.position[links.sender] - row.seen.position[links.receiver]
         ahead = spacing > 0.0  # each pair once
         names = [f"{ids[s]}-{ids[r]}" for s, r in zip(links.sender, links.receiver, strict=True)] if len(spacing) < 64 else None
@@ -50,6 +52,16 @@ class Alarms:
             for k in hit.tolist():
                 who = names[k] if names else f"{ids[links.sender[k]]}-{ids[links.receiver[k]]}"
                 yield from self._once(key, who, float(spacing[k]), float(bound[k]))
+
+    def _collisions(self, p: Prepared, row: Row) -> Iterator[dict[str, Any]]:
+        """Trains inside one another, whatever the law: in the order of the step before, so that passing through is seen too."""
+        order = np.lexsort((-row.seen.position, row.track))
+        for known in (self.order, order):
+            a, b = known[:-1], known[1:]
+            gap = row.seen.position[a] - p.consists.train_length()[a] - row.seen.position[b]
+            for k in np.flatnonzero((row.track[a] == row.track[b]) & (gap < -ROUNDING)).tolist():
+                yield from self._once("gap_m", f"{p.scenario.ids[a[k]]}-{p.scenario.ids[b[k]]}", float(gap[k]), 0.0)
+        self.order = order
 
     def _per_train(self, key: str, value: Floats, bound: Floats, broken: Any, ids: Any) -> Iterator[dict[str, Any]]:
         for i in np.flatnonzero(broken).tolist():
