@@ -125,6 +125,24 @@ def test_a_new_link_counts_from_one_control_period_on(tmp_path: Path) -> None:
     assert metrics(run_folder(tmp_path, tables, scenario()))["bounds.spacing_lower_margin_m/2-3"] == 3.0
 
 
+def test_a_longer_control_period_leaves_more_instants_uncounted(tmp_path: Path) -> None:
+    """With T_c = 2 s the first instants that the law can answer for are those of 2 and 3 s: 2-3 at 94 and 95 m."""
+    slow = scenario(run={"duration_s": 4.0, "step_s": 1.0, "control_period_s": 2.0})
+    values = metrics(run_folder(tmp_path, three_trains(), slow))
+    assert values["bounds.spacing_upper_margin_m/2-3"] == 55.0
+
+
+def test_a_link_heard_by_the_train_ahead_only_is_the_same_pair(tmp_path: Path) -> None:
+    tables = three_trains()
+    backward = tables["links"]["sender"] == 1
+    backward &= tables["links"]["receiver"] == 0
+    tables["links"] = {name: column[backward] for name, column in tables["links"].items()}
+    values = metrics(run_folder(tmp_path, tables, scenario()))
+    assert values["formation.final_error_m/1-2"] == 0.0
+    assert values["bounds.spacing_lower_margin_m/1-2"] == 52.0  # -50 m is the upper bound of what train 1 sees
+    assert values["bounds.spacing_upper_margin_m/1-2"] == 97.0
+
+
 def test_formation(tmp_path: Path) -> None:
     """Errors 1-2: -2, 0, 1, 0; 2-3: 10, 6, 4, 5."""
     events = [{"time_s": t, "kind": "topology", "links": []} for t in (0.0, 2.0)]
@@ -211,7 +229,7 @@ def test_units(tmp_path: Path) -> None:
     }  # fmt: skip
     units = {
         "time_s": [0.0, 0.0, 1.0, 1.0], "unit": [1, 2, 1, 2], "position_m": [100.0, 80.0, 110.0, 90.0],
-        "speed_mps": [10.0, 10.0, 10.0, 10.0], "force_n": [3000.0, -1000.0, NAN, NAN], "coupler_m": [0.0, NAN, 0.02, NAN],
+        "speed_mps": [10.0, 10.0, 10.0, 10.0], "force_n": [3000.0, -1000.0, 1500.0, -1000.0], "coupler_m": [0.0, NAN, 0.02, NAN],
         "coupler_force_n": [0.0, NAN, 500.0, NAN], "coupler_min_m": [NAN, NAN, -0.01, np.inf],
         "coupler_max_m": [NAN, NAN, 0.12, -np.inf], "force_min_n": [NAN, NAN, 2000.0, -1500.0],
         "force_max_n": [NAN, NAN, 4000.0, -1000.0],

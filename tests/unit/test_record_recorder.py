@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -112,7 +113,12 @@ here.record(pathlib.Path({str(killed)!r}), steps=40, cuts=(20,))
     assert list(run.trains.time_s[::3]) == list(range(32))  # 33 rows in a full segment, 30 to the cut, 33 in the next
     assert run.events[-1]["time_s"] == 30.0
     (killed / "run.json").unlink()
-    record(killed, start=21, resume=json.loads((tmp_path / "cut.json").read_text()))
+    position = json.loads((tmp_path / "cut.json").read_text())
+    shutil.copytree(killed, tmp_path / "copy")
+    with Recorder(tmp_path / "copy", TABLES, resume=position):  # what was recorded after the cut is gone at once
+        left = {path.name for path in (tmp_path / "copy" / "segments").iterdir()}
+        assert left == {f"{name}-{k:05d}.parquet" for name, count in position["segments"].items() for k in range(count)}
+    record(killed, start=21, resume=position)
     assert contents(killed) == contents(tmp_path / "whole")
 
 
