@@ -216,6 +216,25 @@ def test_start_asks_for_59_and_holds_trains() -> None:
     np.testing.assert_allclose(stands["printed"], [0, 6.4, 0, 0], atol=T / 2)
 
 
+@pytest.mark.parametrize("drop", [False, True])
+def test_lost_messages_are_kept_because_leaving_the_term_out_is_worse(drop: bool) -> None:
+    """70 % lost, under the printed disturbances: error of the ends."""
+    loop = Loop(scene([LINE], FORMATION, np.full(N, V0)), printed)
+    links, rng, heard, worst = loop.scene.links, np.random.default_rng(0), np.zeros((6, 2)), 0.0
+    for k in range(2500):
+        leader = np.array([27000.0 + V0 * k * T, V0, 0.0, 0.0])
+        trains = Trains(loop.own[:, POSITION], loop.own[:, SPEED], np.zeros(N))
+        arrives = (rng.random(6) >= 0.7) | (k == 0)
+        heard = np.where(arrives[:, None], law.message(loop.constants, trains, leader)[links.sender], heard)
+        weight = np.where(arrives, links.weight, 0.0) if drop else links.weight
+        demand = law.demand(loop.constants, trains, leader, links._replace(heard=arrives, weight=weight), heard)
+        d = printed(k, loop.own[:, POSITION])
+        kick = point.Kick(d.position, d.speed, d.input)
+        loop.own = point.advance(loop.plant, loop.own, demand.acceleration, T, kick).own
+        worst = max(worst, loop.spread()[0]) if k > 1250 else worst
+    assert worst == pytest.approx(45.0 if drop else 14.6, abs=0.5)
+
+
 # --- the l1 bound ----------------------------------------------------------------------------------------------------------------
 
 

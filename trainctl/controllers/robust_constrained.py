@@ -21,10 +21,11 @@ Departs from the paper:
 
 * Every message is the position minus the reference's, so one that is one period old does not lag behind by v0 T per neighbour.
   Where all messages are fresh this is eq. (6).
-* A lost message (the paper knows none): the last one is kept. In this frame that takes the silent neighbour to run on at v0, which
-  it does but for its own error, and the loop becomes one with a delay. Leaving the term out instead would leave a train that hears
-  nobody without any position to hold, and constant disturbances would carry it away without bound. A train that has never heard
-  one of its neighbours does not accelerate.
+* A lost message (the paper knows none): the last one is kept. In this frame that takes the silent neighbour to run on at v0, so
+  the loop becomes one with a delay. Leaving the term out instead makes the loop weaker: in the paper's example with 70 % of the
+  messages lost the greatest error of the ends is 15 m with the first rule (12.5 m without losses) and 45 m with the second. A
+  neighbour that falls silent for good is safe with neither: see ``links.parquet`` for what was heard. A train that has never
+  heard one of its neighbours does not accelerate.
 * There is no spacing constraint: see ``warnings``.
 """
 
