@@ -39,6 +39,7 @@ from trainctl.signals import POSITION, SPEED, Floats, Ints, Links, Scene, Table,
 
 CLOCK: Literal["continuous"] = "continuous"
 ORDER: Literal["parallel"] = "parallel"
+JOIN: Literal["start_condition"] = "start_condition"
 WATCHED = ("interval_m",)
 
 #: Columns of a message: head and tail relative to the leader (the tail moved forward by the units ahead of it), train length.

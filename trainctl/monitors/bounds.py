@@ -23,7 +23,7 @@ class Alarms:
     """Which bounds have been broken so far, and how often (steps)."""
 
     count: dict[tuple[str, str], int] = field(default_factory=dict)
-    order: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    neighbours: Ints = field(default_factory=lambda: np.zeros((2, 0), np.int64))  # (ahead, behind) on one track, a step ago
 
     @property
     def total(self) -> int:
@@ -56,12 +56,13 @@ class Alarms:
     def _collisions(self, p: Prepared, row: Row) -> Iterator[dict[str, Any]]:
         """Trains inside one another, whatever the law: in the order of the step before, so that passing through is seen too."""
         order = np.lexsort((-row.seen.position, row.track))
-        for known in (self.order, order):
-            a, b = known[:-1], known[1:]
+        beside = row.track[order[:-1]] == row.track[order[1:]]
+        now = np.stack([order[:-1][beside], order[1:][beside]])
+        for a, b in (self.neighbours, now):
             gap = row.seen.position[a] - p.consists.train_length()[a] - row.seen.position[b]
             for k in np.flatnonzero((row.track[a] == row.track[b]) & (gap < -ROUNDING)).tolist():
                 yield from self._once("gap_m", f"{p.scenario.ids[a[k]]}-{p.scenario.ids[b[k]]}", float(gap[k]), 0.0)
-        self.order = order
+        self.neighbours = now
 
     def _per_train(self, key: str, value: Floats, bound: Floats, broken: Any, ids: Any) -> Iterator[dict[str, Any]]:
         for i in np.flatnonzero(broken).tolist():
