@@ -135,16 +135,27 @@ def test_head_jerk_is_that_of_equation_37():
 
 
 def test_old_messages_are_carried_on_in_the_moving_frame():
+    """A sender whose acceleration relative to the leader has been constant: its old message is as good as a new one."""
     s = scene()
-    now = Evaluated(s)
-    leader = np.array([50500.0, 30.0, 0.0, 0.0])
-    heard, age = np.zeros((4, 4)), 0.7
-    for row, sender in enumerate(s.links.sender):  # what was true 0.7 s ago, of a sender whose jerk has been constant
-        dx, dv, dw, dG = now.sent[sender]
-        old_w, old_v = dw - dG * age, dv - dw * age + dG * age**2 / 2
-        heard[row] = dx - dv * age + dw * age**2 / 2 - dG * age**3 / 6, old_v, old_w, dG
-    later = Evaluated(s, age=age, heard=heard, leader=leader)
-    np.testing.assert_allclose(later.out, now.out, rtol=1e-9)
+    rng = np.random.default_rng(2)
+    fresh, age = np.column_stack([rng.normal(0.0, 5.0, (4, 3)), np.zeros(4)]), 0.7
+    fresh[:, 0] += s.links.slot[s.links.sender]
+    old = fresh.copy()
+    old[:, 1] -= age * fresh[:, 2]
+    old[:, 0] -= age * fresh[:, 1] - age**2 / 2 * fresh[:, 2]
+    np.testing.assert_allclose(Evaluated(s, age=age, heard=old).out, Evaluated(s, heard=fresh).out, rtol=1e-9)
+
+
+def test_the_jerk_of_an_old_message_fades():
+    """Far enough in the past only the acceleration it has left behind remains, FADE times the jerk."""
+    s = scene()
+    heard = np.zeros((4, 4))
+    heard[:, 0] = s.links.slot[s.links.sender]
+    left = heard.copy()
+    heard[:, 3], left[:, 2] = 3.0, 3.0 * law.FADE
+    later, now = Evaluated(s, age=50.0, heard=heard).out, Evaluated(s, heard=left).out
+    np.testing.assert_allclose(later, now, rtol=1e-9)
+    assert abs(Evaluated(s, heard=heard).out[2] - now[2]) > 1e3  # at once, the jerk itself counts
 
 
 def test_only_the_train_ahead_counts():
