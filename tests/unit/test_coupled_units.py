@@ -240,6 +240,7 @@ def test_rotating_mass_takes_its_share_of_the_room() -> None:
         for bound in (mu[0], most[0]):
             held.acceleration[:] = bound - shared.mean_resistance(consists, speed * one)
             assert not coupled_units.limit(0, plant, own, demand(held, own))
+    assert demand(held, own) == pytest.approx(np.full(4, 2.4e6 / 85.0), rel=1e-12)  # and not less than there is
 
 
 def test_no_period_where_the_units_cannot_hold_the_band() -> None:
