@@ -19,6 +19,10 @@ from trainctl.record.series import INSTANT, Pairs, Series, pairs, series
 from trainctl.signals import Bools, Floats
 
 
+#: Events that the train graph marks.
+SHOWN_EVENTS = ("topology", "reroute", "join", "leave", "fault", "limit")
+
+
 @dataclass
 class Drawn:
     """A run made ready for drawing."""
@@ -172,10 +176,11 @@ def train_graph(drawn: Drawn) -> Figure:
     figure, axes = style.panels(1 if reference is None else 2, drawn.width, 60.0)
     time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
     track = drawn.trains.frame["track"].astype(str).to_numpy()
-    tracks = sorted(set(track), key=lambda name: (len(name), name))
+    tracks, switched = sorted(set(track), key=lambda name: (len(name), name)), False
     for name, rows in drawn.trains.slices():
         at, on = time[rows], track[rows]
         cuts = np.flatnonzero(on[1:] != on[:-1]) + 1
+        switched |= len(cuts) > 0
         absolute = position[rows] / 1000
         relative = absolute - (0.0 if reference is None else leader(reference, at)[0] / 1000)
         for panel, value in zip(axes, (absolute, relative), strict=False):
@@ -188,10 +193,10 @@ def train_graph(drawn: Drawn) -> Figure:
                     f"{on[k - 1]}→{on[k]}", (at[k], value[k]), xytext=(6, 0), textcoords="offset points", fontsize=6.5,
                     va="center", color=drawn.colour[name], zorder=5, bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6},
                 )  # fmt: skip
-    for event in drawn.run.events:
-        if event["kind"] in ("topology", "reroute", "join", "leave", "fault", "limit") and event["time_s"] > time.min():
-            for panel in axes:
-                panel.axvline(event["time_s"], color=style.GREY, linewidth=0.5, zorder=1)
+    happened = {event["time_s"] for event in drawn.run.events if event["kind"] in SHOWN_EVENTS and event["time_s"] > time.min()}
+    for at_time in happened:
+        for panel in axes:
+            panel.axvline(at_time, color=style.GREY, linewidth=0.5, zorder=1)
     axes[0].set_ylabel("position [km]")
     if reference is not None:
         axes[1].set_ylabel(r"$x_i - x_r$ [km]")
@@ -206,9 +211,12 @@ def train_graph(drawn: Drawn) -> Figure:
         Line2D([], [], color=style.GREY, linestyle=style.TRACK_STYLES[k % len(style.TRACK_STYLES)], label=f"track {name}")
         for k, name in enumerate(tracks)
     ]
-    switch = Line2D([], [], color=style.GREY, linestyle="none", marker="o", markersize=4, label="changes track")
-    event_line = Line2D([], [], color=style.GREY, linewidth=0.5, label="event")
-    style.legend(figure, drawn.width, [*handles, *styles, switch, event_line])
+    marks = []
+    if switched:
+        marks.append(Line2D([], [], color=style.GREY, linestyle="none", marker="o", markersize=4, label="changes track"))
+    if happened:
+        marks.append(Line2D([], [], color=style.GREY, linewidth=0.5, label="event"))
+    style.legend(figure, drawn.width, [*handles, *styles, *marks])
     return figure
 
 

@@ -169,7 +169,9 @@ def of_formation(links: Series, starts: Floats, band_m: float) -> Values:
         inside = (instants >= begin - INSTANT / 2) & (instants < end - INSTANT / 2)
         if inside.any():
             after = settled(instants[inside], worst[inside], band_m)
-            values[f"formation.window_settling_s/{begin:g}"] = None if after is None else after - (begin - instants[inside][0])
+            values[f"formation.window_settling_s/{begin:g}"] = (
+                None if after is None else float(after - (begin - instants[inside][0]))
+            )
     last = np.abs(time - time.max()) < INSTANT
     put_worst(values, "formation.final_error_m", links, np.where(last, np.abs(error), -np.inf), np.maximum)
     window = np.searchsorted(starts, time + INSTANT / 2, side="right")
