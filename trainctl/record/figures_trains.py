@@ -18,7 +18,6 @@ from trainctl.record.run import Run
 from trainctl.record.series import INSTANT, Pairs, Series, pairs, series
 from trainctl.signals import Bools, Floats
 
-
 #: Events that the train graph marks.
 SHOWN_EVENTS = ("topology", "reroute", "join", "leave", "fault", "limit")
 
