@@ -54,6 +54,9 @@ ORDER: Literal["chain"] = "chain"
 MESSAGE = 4
 WATCHED = ("spacing_error_m", "speed_error_mps", "q_error_mps")
 
+#: A train is linked only once (39) holds: the barrier has no value outside.
+JOIN: Literal["start_condition"] = "start_condition"
+PLANTS = ("actuated_units",)
 #: Observers whose ``estimate`` and ``correction`` have the columns below.
 OBSERVERS = ("asymptotic", "intermediate")
 X, V, W = 0, 1, 2

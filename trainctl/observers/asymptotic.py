@@ -171,7 +171,9 @@ def violations(params: Params, scene: Scene) -> list[str]:
         )
     most = tolerated_speed_offset(params, scene)
     if abs(params.start_offset_speed_mps) > most:
-        found.append(f"observer.start_offset_speed_mps = {params.start_offset_speed_mps:g}: the start may be wrong by at most {most:g} m/s")
+        found.append(
+            f"observer.start_offset_speed_mps = {params.start_offset_speed_mps:g}: the start may be wrong by at most {most:g} m/s"
+        )
     return found
 
 
