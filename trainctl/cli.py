@@ -189,11 +189,11 @@ def check(name: ScenarioName = DEFAULT_SCENARIO, settings: Settings = None, as_j
     if as_json:
         _print_json(found)
         return
-    print(f"{prepared.file}: no mistakes; every assumption of {prepared.scenario.controller.law} holds")
+    print(f"{prepared.file}: no mistakes, no start condition of {prepared.scenario.controller.law} broken")
     table = _table(None, "", "")
     table.show_header = False
     for key, value in found.items():
-        if key not in ("warnings", "report"):
+        if key not in ("warnings", "report", "analysis"):
             table.add_row(key, str(value))
     _print(table)
     for line in found["report"]:

@@ -27,7 +27,11 @@ def facts(p: Prepared) -> dict[str, Any]:
     }
     if p.sampled:
         found |= {"control_period_s": scene.control_period, "lead_theta": p.theta}
-        if p.scenario.plant.kind != "point" and np.all(np.isfinite(p.bounds.speed_lower) & np.isfinite(p.bounds.speed_upper)):
+        if (
+            p.scenario.controller.law == "fully_distributed"
+            and p.scenario.plant.kind != "point"
+            and np.all(np.isfinite(p.bounds.speed_lower) & np.isfinite(p.bounds.speed_upper))
+        ):
             speed = np.full(len(p.scenario.ids), p.leader(0.0)[1])
             least = shared.smallest_period(p.consists, speed, p.bounds.speed_lower, p.bounds.speed_upper)
             found["smallest_control_period_s"] = round(float(np.max(least)), 6)
@@ -36,4 +40,6 @@ def facts(p: Prepared) -> dict[str, Any]:
         found["sub_step_s"] = scene.sub_step
     found["warnings"] = list(p.law.warnings(p.params, scene, p.start_track)) if hasattr(p.law, "warnings") else []
     found["report"] = list(p.law.report(p.params, scene, p.scenario.disturbance)) if hasattr(p.law, "report") else []
+    if hasattr(p.law, "analysis"):
+        found["analysis"] = p.law.analysis(p.params, scene, p.scenario.disturbance).as_dict()
     return found

@@ -81,11 +81,11 @@ class Simulation:
         self._topology(t, seen)
         disturbed = disturbance.at(self.signals, self.k, t, seen.position)
         if self.p.sampled and self.k % self.p.scenario.run.held_steps == 0:
-            self.demand = self._control(t, disturbed)
+            self.demand = self._protect(self._control(t, disturbed))
         before, past = self.own, self._past()
         self.own, motion = self.motion.advance(self.k, t, before, self.demand, self.links, self.exchange, disturbed)
         self._check(t, motion)
-        self._record(t, seen, before, motion, past)
+        self._record(t, seen, before, motion, past, disturbed)
         self.world.move(motion.displacement, self.p.scenario.run.step_s)
         self.k += 1
 
@@ -99,7 +99,7 @@ class Simulation:
                 progress(self.k, steps)
         seen = self._measure()
         self._topology(self.time, seen)
-        self._record(self.time, seen, self.own, None, self._past())
+        self._record(self.time, seen, self.own, None, self._past(), None)
 
     def _start(self) -> None:
         p, line = self.p, self.p.line
@@ -237,6 +237,18 @@ class Simulation:
             raise LawError(f"law {self.p.scenario.controller.law} gave a number that is not finite for train {names} at {t:g} s")
         return demand
 
+    def _protect(self, demand: Demand) -> Demand:
+        """Speed and input clamps of a law whose model has them, for trains of units (point trains clamp in the plant)."""
+        p, bounds = self.p, self.p.bounds
+        if not getattr(p.law, "CLAMPED", False) or isinstance(self.motion, Points):
+            return demand
+        speed, resistance = self.own[p.heads, SPEED], self.motion.believed_resistance(self.own)
+        period = p.scenario.run.control_period_s or p.scenario.run.step_s
+        asked = demand.acceleration
+        given = np.clip(asked, bounds.input_lower - resistance, bounds.input_upper - resistance)
+        given = np.clip(given, (bounds.speed_lower - speed) / period, (bounds.speed_upper - speed) / period)
+        return Demand(given, demand.saturated | (given != asked))
+
     def _check(self, t: float, motion: Motion) -> None:
         """Numbers must stay finite; a train never moves backwards; bounds that break are told once."""
         wrong = np.flatnonzero(~np.isfinite(motion.displacement))
@@ -254,13 +266,16 @@ class Simulation:
         """Extremes since the last row, if one is due now."""
         return self.motion.taken() if self._recorded and isinstance(self.motion, Units) else None
 
-    def _record(self, t: float, seen: Seen, own: Floats, motion: Motion | None, past: Extremes | None) -> None:
+    def _record(
+        self, t: float, seen: Seen, own: Floats, motion: Motion | None, past: Extremes | None,
+        disturbed: disturbance.Disturbed | None,
+    ) -> None:  # fmt: skip
         """Hand everything to the journal, and watch the bounds at every step, recorded or not."""
         assert self.links is not None
         heads = own[self.p.heads]
         row = Row(
             time=t, seen=seen, track=self.track, own=own, speed=heads[:, SPEED], ahead=self.ahead, links=self.links,
-            motion=motion, saturated=self._saturated(motion), extremes=past,
+            motion=motion, saturated=self._saturated(motion), extremes=past, disturbed=disturbed,
         )  # fmt: skip
         for alarm in self.alarms.new(self.p, row):
             self.journal.event(t, "violation", **alarm)

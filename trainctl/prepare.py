@@ -360,13 +360,20 @@ def _initial(scenario: Scenario, consists: Consists, states: int) -> Floats:
 def _bounds(scenario: Scenario, consists: Consists) -> Bounds:
     """The scenario's bounds; where it states no input bounds, what the units can always give within the speed band."""
     bounds = scenario.bounds_of_trains()
-    if scenario.plant.kind == "point":
-        return bounds
-    least, greatest = shared.room(consists, bounds.speed_lower, bounds.speed_upper)
+    least, greatest = _room(scenario, consists)
     return bounds._replace(
         input_lower=np.where(np.isfinite(bounds.input_lower), bounds.input_lower, least),
         input_upper=np.where(np.isfinite(bounds.input_upper), bounds.input_upper, greatest),
     )
+
+
+def _room(scenario: Scenario, consists: Consists) -> tuple[Floats, Floats]:
+    """Input the units can give anywhere in the speed band, infinite for points and where there is no band."""
+    bounds = scenario.bounds_of_trains()
+    n = len(scenario.train)
+    if scenario.plant.kind == "point" or not np.all(np.isfinite(bounds.speed_lower) & np.isfinite(bounds.speed_upper)):
+        return np.full(n, -np.inf), np.full(n, np.inf)
+    return shared.room(consists, bounds.speed_lower, bounds.speed_upper)
 
 
 def _resolved(scenario: Scenario, bounds: Bounds) -> Scenario:
@@ -400,11 +407,14 @@ def _fits(p: Prepared) -> list[str]:
         ):
             if not low < high:
                 found.append(f"train[{t.id}]: {key} bounds {low:g} .. {high:g} are empty")
+    if getattr(p.law, "CLAMPED", False) and p.scenario.plant.kind == "point":
+        for key in type(p.plant_params).model_fields:
+            clamp, bound = getattr(p.plant_params, key), getattr(p.scenario.bounds, key)
+            if clamp != bound:
+                found.append(f"plant.{key} = {clamp}: must be [bounds] {key} = {bound}, this law's model clamps there")
     found += [*_messages_fit(p), *_disturbances_fit(p)]
     if p.scenario.plant.kind != "point" and p.sampled:
-        least, greatest = shared.room(
-            p.consists, p.scenario.bounds_of_trains().speed_lower, p.scenario.bounds_of_trains().speed_upper
-        )
+        least, greatest = _room(p.scenario, p.consists)
         for i, t in enumerate(p.scenario.train):
             if p.bounds.input_lower[i] < least[i] - 1e-12:
                 found.append(

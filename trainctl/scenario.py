@@ -27,7 +27,6 @@ from trainctl.signals import Bounds, Consists, Table
 SCHEMA_VERSION = 1
 
 
-
 def _name(value: Any) -> Any:
     """Ids are text; a number may stand for one."""
     return str(value) if isinstance(value, int) and not isinstance(value, bool) else value

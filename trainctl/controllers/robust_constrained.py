@@ -45,6 +45,9 @@ from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, Scen
 
 CLOCK: Literal["sampled"] = "sampled"
 
+#: The model clamps speed and input, so a point plant must have the scenario's bounds as its clamps.
+CLAMPED = True
+
 #: Assumption 1: the input must exceed this many times the running resistance.
 KAPPA = 10.0
 
@@ -118,11 +121,12 @@ def violations(params: Params, scene: Scene) -> list[str]:
 
     Notes
     -----
-    Assumption 2 beyond 0 < h T < 1 is not required: the paper's own example breaks it and runs all the same. ``analysis`` says so.
+    Assumption 1, and Assumption 2 beyond 0 < h T < 1, are not required: no EMU has ten times the force its resistance takes, and the
+    paper's own example breaks the second and runs all the same. ``warnings`` and ``analysis`` say so.
     """
     n = len(scene.trains)
     loop_faults = _gain_violations(params, scene) + _graph_violations(scene)
-    found = loop_faults + _clamp_violations(scene) + _assumption_1(scene)
+    found = loop_faults + _clamp_violations(scene)
     for members in robust_gain.formations(scene) if not loop_faults else []:
         if 1 < len(members) <= robust_gain.DENSE:
             found += _unstable(gains(params, n)[members], robust_gain.restrict(scene, members))
@@ -221,16 +225,15 @@ def _broken(scene: Scene, key: str, value: Floats, broken: Bools, rule: str) -> 
 
 
 def _assumption_1(scene: Scene) -> list[str]:
-    found, bounds = [], scene.bounds
+    """Trains whose input is not ten times their resistance: the theorem then says nothing of them."""
+    found: list[str] = []
     r = robust_gain.greatest_resistance(scene)
-    for i, name in enumerate(scene.trains):
-        for key, value in (("input_upper", bounds.input_upper[i]), ("input_lower", -bounds.input_lower[i])):
-            if np.isfinite(value) and np.isfinite(r[i]) and value > 0.0 and value <= KAPPA * r[i]:
-                sign = -value if key == "input_lower" else value
-                found.append(
-                    f"bounds.{key}_mps2 = {sign:g}: only {value / r[i]:.2f} times the resistance {r[i]:.4f} m/s2 of train {name} "
-                    f"at {bounds.speed_upper[i]:g} m/s; Assumption 1 needs more than {KAPPA:g} times"
-                )
+    for field, value in (("input_upper", scene.bounds.input_upper), ("input_lower", -scene.bounds.input_lower)):
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = value / r
+        short = np.isfinite(ratio) & (value > 0.0) & (ratio <= KAPPA)
+        rule = f"times the running resistance is all the input allows, Assumption 1 needs more than {KAPPA:g}"
+        found += _broken(scene, f"bounds.{field}_mps2:", np.round(ratio, 2), short, rule)
     return found
 
 
@@ -261,6 +264,7 @@ def warnings(params: Params, scene: Scene, tracks: Sequence[int] | None = None) 
             f"link: the law has no spacing constraint and not every follower hears its predecessor on the track: {_some(deaf)}; "
             "such graphs can end in a collision from starts that braking would save"
         )
+    found += _assumption_1(scene)
     speeds = _speeds(scene)
     if np.ptp(speeds) > 0.0:
         found.append(f"reference: its speed changes ({np.min(speeds):g} to {np.max(speeds):g} m/s); the paper's v0 is constant")

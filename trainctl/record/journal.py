@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from trainctl.motion import Motion
+    from trainctl.plants.disturbance import Disturbed
     from trainctl.plants.integrate import Extremes
     from trainctl.prepare import Prepared
     from trainctl.world import Seen
@@ -31,6 +33,16 @@ class Row(NamedTuple):
     motion: Motion | None
     saturated: Bools  # (n,)
     extremes: Extremes | None  # over the sub-steps since the last row
+    disturbed: Disturbed | None  # what acts from this instant on
+
+
+#: A killed run loses at most what it recorded in this time [s].
+SAVE_EVERY_S = 10.0
+
+#: Columns of trains.parquet in a run with disturbances, as in ``plants.disturbance.Disturbed``.
+DISTURBANCES = (
+    "disturbance_position_m", "disturbance_speed_mps", "disturbance_input_mps2", "resistance_factor", "measurement_error_m",
+)  # fmt: skip
 
 
 class Journal:
@@ -42,11 +54,13 @@ class Journal:
         watched = tuple(getattr(p.law, "WATCHED", ())) if self.has_units and not p.sampled else ()
         self.watched = watched
         self.extras = UNIT_EXTRAS if p.scenario.plant.kind == "actuated_units" else ()
+        self.disturbances = DISTURBANCES if p.scenario.disturbance else ()
         tables = standard_tables(
             p.scenario.ids, p.line.track_ids, p.line.edges, units=self.has_units, watched=watched,
-            train_extras=ENERGIES if self.has_units else (), unit_extras=self.extras,
+            train_extras=(*(ENERGIES if self.has_units else ()), *self.disturbances), unit_extras=self.extras,
         )  # fmt: skip
-        self.recorder = Recorder(folder, tables)
+        self.recorder = Recorder(folder, tables, {"scenario_sha256": p.scenario.hash()})
+        self.saved = time.monotonic()
         self.train_of_unit = np.repeat(np.arange(len(p.scenario.train)), np.diff(p.consists.first))
         self.unit = np.arange(len(self.train_of_unit)) - p.consists.first[:-1][self.train_of_unit] + 1
         self.last = np.append(self.train_of_unit[1:] != self.train_of_unit[:-1], True)
@@ -57,13 +71,19 @@ class Journal:
         self.recorder.event(round(time, 9), kind, **fields)
 
     def write(self, row: Row) -> None:
-        """One instant of every table."""
+        """One instant of every table. Every few seconds what was written is closed, so that a killed run keeps it."""
+        if time.monotonic() - self.saved > SAVE_EVERY_S:
+            self.recorder.cut()
+            self.saved = time.monotonic()
         n = len(row.ahead)
         spacing = np.where(row.ahead >= 0, row.seen.position[row.ahead] - row.seen.position, np.nan)
         motion = row.motion
         extra: dict[str, Any] = {}
         if self.has_units:
             extra = self._units(row)
+        if self.disturbances:
+            acting = [np.full(n, np.nan)] * len(self.disturbances) if row.disturbed is None else row.disturbed
+            extra |= dict(zip(self.disturbances, acting, strict=True))
         self.recorder.write(
             "trains", time_s=row.time, train=np.arange(n), track=row.track, edge=row.seen.edge, position_m=row.seen.position,
             speed_mps=row.speed, input_mps2=np.full(n, np.nan) if motion is None else motion.input, spacing_m=spacing,
