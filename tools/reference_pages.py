@@ -43,7 +43,7 @@ def page() -> Iterator[str]:
             yield f'\n### `{key} = "{name}"`\n'
             yield from keys(importlib.import_module(f"trainctl.{package}.{name}").Params)
     yield "\n## Metrics\n"
-    yield "`metrics.json` of a run folder, `trainctl metrics RUN`. `name` is the worst or total value, `name/item` that of one item."
+    yield "`metrics.json` of a run folder, `trainctl metrics RUN`. `name` is the worst or total value, `name/item` that of one."
     yield "\n| metric | unit | definition |"
     yield "| --- | --- | --- |"
     for name, (unit, text) in DEFINITIONS.items():

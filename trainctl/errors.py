@@ -1,4 +1,4 @@
-"""What can go wrong, by whose fault it is: the command line turns each into its exit code (DESIGN: 2 bad input, 3 the run failed)."""
+"""What can go wrong, by whose fault it is; the command line turns each into its exit code: 2 bad input, 3 the run failed."""
 
 from __future__ import annotations
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -112,7 +113,7 @@ class Simulation:
                 lane_position=np.array([x for _, x in places]),
                 speed=self.own[p.heads, SPEED],
                 length=p.consists.train_length(),
-                unit_length=[p.consists.length[a:b] for a, b in zip(first[:-1], first[1:], strict=True)],
+                unit_length=[p.consists.length[a:b] for a, b in pairwise(first)],
                 routes=[line.route(t.track, t.position_m) for t in p.scenario.train],
             )
         )
@@ -213,9 +214,12 @@ class Simulation:
         self.ahead[behind] = links.order[rank[behind] - 1]
         groups = graph.components(len(rank), links.sender, links.receiver)
         self.journal.event(
-            t, "topology", edges=graph.edges(links, p.scenario.ids), formations=[[p.scenario.ids[i] for i in sorted(g)] for g in groups],
+            t,
+            "topology",
+            edges=graph.edges(links, p.scenario.ids),
+            formations=[[p.scenario.ids[i] for i in sorted(group)] for group in groups],
             start_condition=[] if before is None else p.law.violations(p.params, scene),
-        )  # fmt: skip
+        )
 
     def _control(self, t: float, disturbed: disturbance.Disturbed) -> Demand:
         """Exchange messages and evaluate the sampled law."""

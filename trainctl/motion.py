@@ -130,8 +130,8 @@ class Units:
             self._exchange(begin, moved, links, exchange)
             self._make_noise(begin)
             applied = integrate.advance(
-                self.parts, self.loop, first, p.consists.length, links, p.reference, self.air, begin, self.h, sub_steps, self.breaks,
-                moved, self.estimate, self.work, self.extremes,
+                self.parts, self.loop, first, p.consists.length, links, p.reference, self.air, begin, self.h, sub_steps,
+                self.breaks, moved, self.estimate, self.work, self.extremes,
             )  # fmt: skip
             demanded = applied if demanded is None else demanded
         assert demanded is not None

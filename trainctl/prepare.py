@@ -199,7 +199,9 @@ def prepare(scenario: Scenario, file: str, folder: Path, known: Sequence[str] = 
     )  # fmt: skip
     unfit = _fits(prepared)
     found += unfit or [
-        *_connected(prepared), *law.violations(params, prepared.first_scene), *observer.violations(observer_params, prepared.first_scene)
+        *_connected(prepared),
+        *law.violations(params, prepared.first_scene),
+        *observer.violations(observer_params, prepared.first_scene),
     ]  # fmt: skip
     if network is not None:
         prepared = replace(prepared, line=network[0], spec=network[1], net=network[2])
@@ -295,7 +297,8 @@ def _on_the_line(scenario: Scenario, line: Line) -> list[str]:
             if t.position_m - length < line.begin_m:
                 tail = t.position_m - length
                 found.append(
-                    f"{here}.position_m = {t.position_m:.10g}: its tail at {tail:.10g} m is off the line, which begins at {line.begin_m:.10g} m"
+                    f"{here}.position_m = {t.position_m:.10g}: its tail at {tail:.10g} m is off the line, which begins at"
+                    f" {line.begin_m:.10g} m"
                 )
             placed.append((t.track, t.position_m, length, t.id))
     for (track, x, length, i), (other, y, _, j) in pairwise(sorted(placed, key=lambda p: (p[0], -p[1]))):
@@ -418,11 +421,13 @@ def _fits(p: Prepared) -> list[str]:
         for i, t in enumerate(p.scenario.train):
             if p.bounds.input_lower[i] < least[i] - 1e-12:
                 found.append(
-                    f"train[{t.id}].input_lower_mps2 = {p.bounds.input_lower[i]:g}: its units can brake with {-least[i]:.6g} m/s2 at most"
+                    f"train[{t.id}].input_lower_mps2 = {p.bounds.input_lower[i]:g}: its units can brake with"
+                    f" {-least[i]:.6g} m/s2 at most"
                 )
             if p.bounds.input_upper[i] > greatest[i] + 1e-12:
                 found.append(
-                    f"train[{t.id}].input_upper_mps2 = {p.bounds.input_upper[i]:g}: its units can give {greatest[i]:.6g} m/s2 at most at the upper speed bound"
+                    f"train[{t.id}].input_upper_mps2 = {p.bounds.input_upper[i]:g}: its units can give"
+                    f" {greatest[i]:.6g} m/s2 at most in the speed band"
                 )
     return found
 
@@ -432,8 +437,8 @@ def _long_enough(p: Prepared) -> list[str]:
     end = p.scenario.run.duration_s
     travel = p.leader(end)[0] - p.leader(0.0)[0]
     return [
-        f"run.duration_s = {end:g}: at the reference speed train {t.id} reaches {t.position_m + travel:.0f} m, beyond the line's end at"
-        f" {p.line.end_m:.10g} m"
+        f"run.duration_s = {end:g}: at the reference speed train {t.id} reaches {t.position_m + travel:.0f} m, beyond the"
+        f" line's end at {p.line.end_m:.10g} m"
         for t in p.scenario.train
         if t.position_m <= p.line.end_m < t.position_m + travel
     ]

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from trainctl.errors import InputError
 from trainctl.plants.disturbance import Disturbance
@@ -258,7 +258,7 @@ class Event(Table):
 class Module(Table):
     """A table whose further keys belong to the module it names."""
 
-    model_config = {**Table.model_config, "extra": "allow"}
+    model_config = ConfigDict(extra="allow")
 
     def keys(self) -> dict[str, Any]:
         """The further keys, as read."""

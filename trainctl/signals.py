@@ -196,8 +196,10 @@ class ContinuousLaw(Protocol):
         self, i: int, constants: Any, leader: Floats, age: float, slot: float, own: Floats, estimate: Floats,
         correction: Floats, desired: Floats, heard: Floats, out: Floats,
     ) -> None:  # fmt: skip
-        """Write the demanded force of each unit [N] into ``out``. ``desired`` (k,) and ``heard`` (k, w) are the rows of the k
-        links train ``i`` hears on; ``age`` [s] is how old ``heard`` is (0 in the exact mode).
+        """Write the demanded force of each unit [N] into ``out``.
+
+        ``desired`` (k,) and ``heard`` (k, w) are the rows of the k links train ``i`` hears on; ``age`` [s] is how old ``heard`` is
+        (0 in the exact mode).
         """
 
     def message(
@@ -212,17 +214,29 @@ class ContinuousLaw(Protocol):
 class Observer(Protocol):
     """Estimates per unit, integrated with plant and law; compiled like a continuous law.
 
-    ``WIDTH`` columns of ``estimate`` and ``CORRECTIONS`` columns of ``correction`` per unit; none if there is no observer.
+    ``width(params)`` columns of ``estimate`` and ``CORRECTIONS`` columns of ``correction`` per unit; none if there is no observer.
     """
 
-    WIDTH: int
     CORRECTIONS: int
+    Params: Any
 
-    def correction(self, i: int, constants: Any, own: Floats, estimate: Floats, out: Floats) -> None: ...
+    def width(self, params: Any) -> int:
+        """Columns of ``estimate`` per unit."""
 
-    def rate(
-        self, i: int, constants: Any, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats
-    ) -> None: ...
+    def violations(self, params: Any, scene: Scene) -> list[str]:
+        """As in ``SampledLaw``."""
+
+    def constants(self, params: Any, scene: Scene) -> Any:
+        """As in ``ContinuousLaw``."""
+
+    def initial(self, params: Any, own: Floats) -> Floats:
+        """Estimates at the start, shape (U, width)."""
+
+    def correction(self, i: int, constants: Any, own: Floats, estimate: Floats, out: Floats) -> None:
+        """Write the corrections of train ``i``, which the law may read, into ``out`` (units, CORRECTIONS)."""
+
+    def rate(self, i: int, constants: Any, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats) -> None:
+        """Write d(estimate)/dt into ``out``; ``applied`` [N] is what the limits left of the demand."""
 
 
 class Plant(Protocol):
@@ -236,8 +250,9 @@ class Plant(Protocol):
     def rate(
         self, i: int, constants: Any, t: float, inside: float, own: Floats, applied: Floats, out: Floats, power: Floats
     ) -> None:
-        """Write d(own)/dt into ``out`` and the train's powers [W] into ``power`` (6,): see ``POWERS``. ``inside`` is a time
-        within the piece meant where something jumps at ``t``.
+        """Write d(own)/dt into ``out`` and the train's powers [W] into ``power`` (6,), see ``POWERS``.
+
+        ``inside`` is a time within the piece meant where something jumps at ``t``.
         """
 
 

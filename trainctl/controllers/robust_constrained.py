@@ -121,8 +121,8 @@ def violations(params: Params, scene: Scene) -> list[str]:
 
     Notes
     -----
-    Assumption 1, and Assumption 2 beyond 0 < h T < 1, are not required: no EMU has ten times the force its resistance takes, and the
-    paper's own example breaks the second and runs all the same. ``warnings`` and ``analysis`` say so.
+    Assumption 1, and Assumption 2 beyond 0 < h T < 1, are not required: no EMU has ten times the force its resistance takes, and
+    the paper's own example breaks the second and runs all the same. ``warnings`` and ``analysis`` say so.
     """
     n = len(scene.trains)
     loop_faults = _gain_violations(params, scene) + _graph_violations(scene)

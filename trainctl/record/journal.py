@@ -109,8 +109,9 @@ class Journal:
         x = row.extremes
         assert x is not None
         self.recorder.write(
-            "units", time_s=row.time, train=self.train_of_unit, unit=self.unit, position_m=own[:, POSITION], speed_mps=own[:, SPEED],
-            force_n=force, coupler_m=stretch, coupler_force_n=p.consists.stiffness * stretch + p.consists.damping * rate,
+            "units", time_s=row.time, train=self.train_of_unit, unit=self.unit,
+            position_m=own[:, POSITION], speed_mps=own[:, SPEED], force_n=force,
+            coupler_m=stretch, coupler_force_n=p.consists.stiffness * stretch + p.consists.damping * rate,
             coupler_min_m=_widened(np.fmin, x.coupler_min, stretch), coupler_max_m=_widened(np.fmax, x.coupler_max, stretch),
             force_min_n=_widened(np.fmin, x.force_min, force), force_max_n=_widened(np.fmax, x.force_max, force),
             **(row.motion.extras if row.motion is not None else dict.fromkeys(self.extras, missing)),

@@ -60,15 +60,17 @@ def write_routes(start: Start, path: Path) -> None:
         route = " ".join(start.routes[i])
         rows.append(
             f'    <vehicle id={quoteattr(name)} type="{kind}" depart="0" departLane="0" insertionChecks="none"'
-            f' departPos="{float(start.lane_position[i])!r}" departSpeed="{float(start.speed[i])!r}">\n        <route edges="{route}"/>\n    </vehicle>\n'
+            f' departPos="{float(start.lane_position[i])!r}" departSpeed="{float(start.speed[i])!r}">\n'
+            f'        <route edges="{route}"/>\n    </vehicle>\n'
         )
     with path.open("w", encoding="utf-8") as out:
         out.write("<routes>\n")
         for units, kind in types.items():
             length = max(math.fsum(units), 1.0)  # SUMO has no points
             out.write(
-                f'    <vType id="{kind}" vClass="rail" guiShape="rail" length="{length!r}" carriageLength="{max(max(units), 1.0)!r}"'
-                ' carriageGap="0" minGap="0" sigma="0" speedFactor="1" speedDev="0" maxSpeed="500" accel="100" decel="100"'
+                f'    <vType id="{kind}" vClass="rail" guiShape="rail" length="{length!r}"'
+                f' carriageLength="{max(max(units), 1.0)!r}" carriageGap="0" minGap="0" sigma="0"'
+                ' speedFactor="1" speedDev="0" maxSpeed="500" accel="100" decel="100"'
                 ' emergencyDecel="1000"/>\n'
             )
         out.writelines(rows)

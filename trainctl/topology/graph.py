@@ -27,8 +27,9 @@ class Stated(NamedTuple):
 class Plan(NamedTuple):
     """The scenario's rule, trains in formation order.
 
-    ``desired``, ``lower``, ``upper`` (n - 1,) belong to consecutive trains; ``stated`` to (sender, receiver), mirrored where both hear
-    each other; ``extra`` are pairs that hear each other whenever both are on one track, ``fixed`` the directed pairs of rule "links".
+    ``desired``, ``lower``, ``upper`` (n - 1,) belong to consecutive trains; ``stated`` to (sender, receiver), mirrored where both
+    hear each other; ``extra`` are pairs that hear each other whenever both are on one track, ``fixed`` the directed pairs of rule
+    "links".
     """
 
     rule: Literal["same_track", "links"]
