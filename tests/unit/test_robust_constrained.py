@@ -143,7 +143,7 @@ REFUSED: list[tuple[law.Params, dict[str, Any], list[str]]] = [
     (
         PARAMS,
         {"bounds": BOUNDS._replace(input_upper=np.array([2.0, 1.9, 2.0, np.inf]))},
-        ["bounds.input_upper_mps2 = 1.9: only 9.83 times", "train 2", "inf: must be given", "train 4"],
+        ["bounds.input_upper_mps2 = inf: must be given", "train 4"],
     ),
     (PARAMS, {"bounds": BOUNDS._replace(input_lower=np.full(4, 0.5))}, ["input_lower_mps2 = 0.5: must be below 0"]),
     (PARAMS, {"bounds": BOUNDS._replace(speed_upper=np.full(4, np.inf))}, ["bounds.speed_upper_mps = inf: must be given"]),
@@ -194,6 +194,14 @@ def test_warns_of_followers_that_do_not_hear_their_predecessor() -> None:
 def test_warns_of_a_reference_that_changes() -> None:
     (found,) = law.warnings(PARAMS, scene(reference=table([(0.0, 80.0), (10.0, 80.0), (20.0, 70.0)], 0.0)))
     assert "70 to 80 m/s" in found
+
+
+def test_warns_of_an_input_below_ten_times_the_resistance() -> None:
+    short = BOUNDS._replace(input_upper=np.array([2.0, 1.9, 2.0, 2.0]))
+    assert law.violations(PARAMS, scene(bounds=short)) == []
+    (found,) = law.warnings(PARAMS, scene(bounds=short))
+    assert "input_upper_mps2: 9.83 times the running resistance" in found
+    assert "(train 2)" in found
 
 
 def test_params_refuse_unknown_keys() -> None:
