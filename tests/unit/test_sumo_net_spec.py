@@ -228,8 +228,10 @@ def test_the_shipped_lines_are_right():
     # 2400 s at 85 m/s from 24 km, and 450 km for the EMU formation.
     assert three.end_m > 24000 + 2400 * 85
     assert three.end_m > 460000
-    leave, join = three.crossover
+    leave, join, emu_leave, emu_join = three.crossover
     assert (leave.id, leave.from_track, leave.to_track) == ("leave", "1", "3")
     assert (join.id, join.from_track, join.to_track) == ("join", "2", "1")
+    assert (emu_leave.from_track, emu_leave.to_track) == ("1", "3")
+    assert (emu_join.from_track, emu_join.to_track) == ("2", "1")
     assert 88920 < join.start_m < 89000
     assert min(leave.speed_mps, join.speed_mps) >= 80

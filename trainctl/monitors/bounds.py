@@ -40,6 +40,7 @@ class Alarms:
             u = row.motion.input
             yield from self._per_train("input_lower_mps2", u, bounds.input_lower, u < bounds.input_lower - ROUNDING, ids)
             yield from self._per_train("input_upper_mps2", u, bounds.input_upper, u > bounds.input_upper + ROUNDING, ids)
+        yield from self._couplers(p, row)
         yield from self._collisions(p, row)
         spacing = row.seen.position[links.sender] - row.seen.position[links.receiver]
         ahead = spacing > 0.0  # each pair once
@@ -52,6 +53,19 @@ class Alarms:
             for k in hit.tolist():
                 who = names[k] if names else f"{ids[links.sender[k]]}-{ids[links.receiver[k]]}"
                 yield from self._once(key, who, float(spacing[k]), float(bound[k]))
+
+    def _couplers(self, p: Prepared, row: Row) -> Iterator[dict[str, Any]]:
+        """Couplers beyond their range in any sub-step since the last row."""
+        x, bounds = row.extremes, p.scenario.bounds
+        if x is None or bounds.coupler_lower_m is None or bounds.coupler_upper_m is None:
+            return
+        for key, value, bound, broken in (
+            ("coupler_lower_m", x.coupler_min, bounds.coupler_lower_m, x.coupler_min < bounds.coupler_lower_m),
+            ("coupler_upper_m", x.coupler_max, bounds.coupler_upper_m, x.coupler_max > bounds.coupler_upper_m),
+        ):
+            for u in np.flatnonzero(broken).tolist():
+                i = int(np.searchsorted(p.consists.first, u, side="right")) - 1
+                yield from self._once(key, f"{p.scenario.ids[i]}.{u - p.consists.first[i] + 1}", float(value[u]), bound)
 
     def _collisions(self, p: Prepared, row: Row) -> Iterator[dict[str, Any]]:
         """Trains inside one another, whatever the law: in the order of the step before, so that passing through is seen too."""
