@@ -179,9 +179,11 @@ class Units:
         number = math.floor(t / self.period + 1e-6)
         if number == self.counted:
             return
+        # On a new edge list nothing has been heard yet: the first messages are those of one common instant.
+        air = self.air._replace(live=True) if self.counted < 0 else self.air
         self.counted = number
         first = self.p.consists.first
-        integrate.exchange(self.parts, self.loop, first, links, self.p.reference, self.air, t, own, self.estimate, self.work)
+        integrate.exchange(self.parts, self.loop, first, links, self.p.reference, air, t, own, self.estimate, self.work)
         exchange.deliver(self.work.sent.copy(), own[self.p.heads, POSITION], links, number)
         fresh = ~exchange.ever
         exchange.heard[fresh] = self.work.sent[links.sender[fresh]]

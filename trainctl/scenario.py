@@ -476,8 +476,10 @@ def _over(base: dict[str, Any], data: dict[str, Any]) -> dict[str, Any]:
         if isinstance(old, dict) and isinstance(value, dict):
             # Another law, plant or observer brings its own keys; the old one's would be unknown to it.
             other = any(k in value and k in old and value[k] != old[k] for k in ("law", "kind"))
-            stated = [k for k in EXCLUSIVE.get(key, ()) if k in value]
-            merged[key] = value if other else _over({k: v for k, v in old.items() if not stated or k not in EXCLUSIVE[key]}, value)
+            dropped = set(EXCLUSIVE.get(key, ())) if any(k in value for k in EXCLUSIVE.get(key, ())) else set()
+            if key == "reference" and dropped and "s_curves" not in value:
+                dropped.add("start_speed_mps")
+            merged[key] = value if other else _over({k: v for k, v in old.items() if k not in dropped}, value)
         elif key == "train" and isinstance(old, list) and isinstance(value, list):
             merged[key] = _trains_over(old, value)
         else:

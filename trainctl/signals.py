@@ -15,8 +15,12 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
+from trainctl.kernels import keep_by_sources
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+keep_by_sources()  # before anything here or above is decorated
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -1,0 +1,30 @@
+"""Where compiled kernels are kept between runs.
+
+Numba notices a change of the file a function stands in, but not of the constants and functions it took in from other files: an
+edit there would leave old kernels at work, silently. So the cache is keyed by all sources that can be compiled.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+from typing import Any
+
+import numba
+
+config: Any = numba.config
+
+
+def keep_by_sources() -> None:
+    """Point numba's cache at a folder of this version of the sources, unless NUMBA_CACHE_DIR says otherwise."""
+    if os.environ.get("NUMBA_CACHE_DIR"):
+        return
+    here = Path(__file__).parent
+    digest = hashlib.sha256(numba.__version__.encode())
+    for path in sorted(
+        [here / "signals.py", *(p for part in ("plants", "controllers", "observers") for p in (here / part).glob("*.py"))]
+    ):
+        digest.update(path.read_bytes())
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    config.CACHE_DIR = str(base / "trainctl" / f"kernels-{digest.hexdigest()[:16]}")
