@@ -35,18 +35,22 @@ OPTIONS = {
     "default.speeddev": "0",
     "no-step-log": "true",
     "no-internal-links": "true",
-    "fcd-output": "fcd.parquet",
     "fcd-output.distance": "true",
-    "tripinfo-output": "tripinfo.xml",
     "tripinfo-output.write-unfinished": "true",
+    "vehroute-output.write-unfinished": "true",
+    "precision": "9",
+    "no-warnings": "false",
+}
+
+#: SUMO's own logs. Given on the command line only: who opens run.sumocfg in sumo-gui must not overwrite them.
+LOGS = {
+    "fcd-output": "fcd.parquet",
+    "tripinfo-output": "tripinfo.xml",
     "summary-output": "summary.xml",
     "statistic-output": "statistics.xml",
     "collision-output": "collisions.xml",
     "vehroute-output": "vehroute.xml",
-    "vehroute-output.write-unfinished": "true",
-    "precision": "9",
     "log": "messages.log",
-    "no-warnings": "false",
 }
 
 
@@ -105,7 +109,8 @@ class Sumo:
         end = (self.steps + 1) * self.time_step
         configuration = write_configuration(self.folder, self.net.name, "trains.rou.xml", self.time_step, end)
         self.ids = list(start.ids)
-        self._call(libsumo.start, ["sumo", "-c", str(configuration)])
+        logs = [part for key, name in LOGS.items() for part in (f"--{key}", str(self.folder / name))]
+        self._call(libsumo.start, ["sumo", "-c", str(configuration), *logs])
         self.began = True
         self._call(libsumo.simulationStep)
         self._verify_insertion(start)
@@ -192,7 +197,7 @@ class Sumo:
 
     def messages(self) -> list[tuple[float | None, str]]:
         """Warnings and errors SUMO wrote, with the time it named, if any."""
-        log = self.folder / OPTIONS["log"]
+        log = self.folder / LOGS["log"]
         if not log.is_file():
             return []
         found = []
