@@ -91,13 +91,17 @@ class Simulation:
         self.k += 1
 
     def run(self, progress: Callable[[int, int], Any] | None = None) -> None:
-        """All steps; ``progress(done, steps)`` is called about a hundred times. Then the last state, which nothing acts on."""
+        """All steps; ``progress(done, steps)`` is called about a hundred times."""
         steps = self.p.scenario.run.steps
         every = max(1, steps // 100)
         while self.k < steps:
             self.step()
             if progress is not None and self.k % every == 0:
                 progress(self.k, steps)
+        self.end()
+
+    def end(self) -> None:
+        """Record the last state, which nothing acts on."""
         seen = self._measure()
         self._topology(self.time, seen)
         self._record(self.time, seen, self.own, None, self._past(), None)
@@ -212,6 +216,7 @@ class Simulation:
         self.ahead = np.full(len(rank), -1)
         behind = links.order[1:][self.formation[links.order[1:]] == self.formation[links.order[:-1]]]
         self.ahead[behind] = links.order[rank[behind] - 1]
+        self.world.linked(links, self.formation)
         groups = graph.components(len(rank), links.sender, links.receiver)
         self.journal.event(
             t,

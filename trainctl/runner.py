@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,6 +30,7 @@ def run(
     force: bool = False,
     command_line: Sequence[str] = (),
     progress: Callable[[int, int], Any] | None = None,
+    gui: str | None = None,
 ) -> Run:
     """Run a scenario into the folder ``out``.
 
@@ -46,6 +48,8 @@ def run(
         For run.json.
     progress : callable, optional
         Called with (steps done, steps).
+    gui : str, optional
+        Program that shows the run, see ``open_world``.
 
     Returns
     -------
@@ -58,6 +62,24 @@ def run(
         The folder may not be replaced, or the scenario turned out to be impossible on the way; nothing is left behind.
     TrainctlError
         The run failed; ``out.partial`` keeps what was recorded, and run.json says why and when.
+    """
+    with opened(p, out, backend, force, command_line, gui) as simulation:
+        simulation.run(progress)
+    return Run(out)
+
+
+@contextmanager
+def opened(
+    p: Prepared,
+    out: Path,
+    backend: Backend = "sumo",
+    force: bool = False,
+    command_line: Sequence[str] = (),
+    gui: str | None = None,
+) -> Iterator[Simulation]:
+    """A run folder and the loop in it, for whoever drives it; arguments and errors as in ``run``.
+
+    When the block ends the run is complete; when it raises, the run failed.
     """
     partial = claim(out, force)
     text = p.scenario.toml()
@@ -74,9 +96,9 @@ def run(
 
     try:
         journal = Journal(partial, p)
-        world = open_world(p, partial, backend)
+        world = open_world(p, partial, backend, gui)
         simulation = Simulation(p, world, journal)
-        simulation.run(progress)
+        yield simulation
         world.close()
         for at, message in world.messages():
             journal.event(simulation.time if at is None else at, "sumo_warning", message=message)
@@ -95,11 +117,14 @@ def run(
             _quietly(ended, status, failure={"reason": str(error) or type(error).__name__, "time_s": when})
         raise
     finish(out)
-    return Run(out)
 
 
-def open_world(p: Prepared, folder: Path, backend: Backend) -> World:
-    """The simulator behind the loop; SUMO's inputs and logs go to ``folder/sumo``."""
+def open_world(p: Prepared, folder: Path, backend: Backend, gui: str | None = None) -> World:
+    """The simulator behind the loop; SUMO's inputs and logs go to ``folder/sumo``.
+
+    ``gui`` names a program that is driven over TraCI and shown the links instead of libsumo: "sumo-gui", or "sumo" for the same
+    without a window.
+    """
     if backend == "numeric":
         return Numeric(p.line)
     from trainctl.sumo.session import Sumo
@@ -114,6 +139,10 @@ def open_world(p: Prepared, folder: Path, backend: Backend) -> World:
             net.write_bytes(p.net.read_bytes())
     except LineError as error:
         raise SimulatorError("; ".join(error.mistakes)) from None
+    if gui is not None:
+        from trainctl.sumo.gui import Gui
+
+        return Gui(p.line, net, place, p.scenario.run.step_s, p.scenario.run.steps, gui)
     return Sumo(p.line, net, place, p.scenario.run.step_s, p.scenario.run.steps)
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from sumo_net import Line
-from trainctl.signals import Floats, Ints
+from trainctl.signals import Floats, Ints, Links
 
 
 class Start(NamedTuple):
@@ -42,6 +42,9 @@ class World(Protocol):
     def route(self, train: int, edges: tuple[str, ...]) -> None:
         """Give a train another route; ``edges`` begins with the edge it is on."""
 
+    def linked(self, links: Links, formation: Ints) -> None:
+        """Who hears whom from now on, and which formation (n,) every train is in: for simulators that show it."""
+
     def move(self, displacement: Floats, step: float) -> None:
         """Let every train move by ``displacement`` (n,) [m] within one step, and end the step."""
 
@@ -72,6 +75,9 @@ class Numeric:
     def route(self, train: int, edges: tuple[str, ...]) -> None:
         """Give a train another route."""
         self.ahead[train] = [self.index[e] for e in edges[1:]]
+
+    def linked(self, links: Links, formation: Ints) -> None:
+        """Nobody looks."""
 
     def move(self, displacement: Floats, step: float) -> None:
         """Move every train; as in SUMO a train on the very end of an edge is still on it."""

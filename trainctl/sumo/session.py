@@ -17,7 +17,7 @@ import numpy as np
 
 from sumo_net import Line
 from trainctl.errors import CouplingError, SimulatorError
-from trainctl.signals import Floats, Ints
+from trainctl.signals import Floats, Ints, Links
 from trainctl.sumo.preflight import objections
 from trainctl.world import Seen, Start
 
@@ -91,7 +91,12 @@ def write_configuration(folder: Path, net: str, routes: str, step: float, end: f
 
 
 class Sumo:
-    """One libsumo simulation. ``folder`` receives SUMO's inputs and its own logs."""
+    """One libsumo simulation. ``folder`` receives SUMO's inputs and its own logs.
+
+    ``api`` is the module that talks to SUMO: libsumo, or another with the same functions.
+    """
+
+    api: Any = libsumo
 
     def __init__(self, line: Line, net: Path, folder: Path, step: float, steps: int) -> None:
         self.line, self.net, self.folder, self.time_step, self.steps = line, net, folder, step, steps
@@ -100,8 +105,7 @@ class Sumo:
 
     def start(self, start: Start) -> None:
         """Load the net, insert the trains, verify each of them, and take every speed correction off."""
-        if libsumo.simulation.isLoaded():
-            raise SimulatorError("SUMO already runs in this process; it can hold one simulation at a time")
+        self._ready()
         wrong = objections(self.line, self.time_step)
         if wrong:
             raise SimulatorError("; ".join(wrong))
@@ -110,25 +114,33 @@ class Sumo:
         configuration = write_configuration(self.folder, self.net.name, "trains.rou.xml", self.time_step, end)
         self.ids = list(start.ids)
         logs = [part for key, name in LOGS.items() for part in (f"--{key}", str(self.folder / name))]
-        self._call(libsumo.start, ["sumo", "-c", str(configuration), *logs])
+        self._call(self._launch, ["-c", str(configuration), *logs])
         self.began = True
-        self._call(libsumo.simulationStep)
+        self._call(self.api.simulationStep)
         self._verify_insertion(start)
-        vehicle = libsumo.vehicle
+        vehicle = self.api.vehicle
         for name in self.ids:
             vehicle.setSpeedMode(name, SPEED_MODE_FREE)
             vehicle.setLaneChangeMode(name, 0)
         self.seen = self._read()
 
+    def _ready(self) -> None:
+        """Whether SUMO can be started at all."""
+        if libsumo.simulation.isLoaded():
+            raise SimulatorError("SUMO already runs in this process; it can hold one simulation at a time")
+
+    def _launch(self, options: list[str]) -> None:
+        libsumo.start(["sumo", *options])
+
     def _verify_insertion(self, start: Start) -> None:
-        present = set(libsumo.vehicle.getIDList())
+        present = set(self.api.vehicle.getIDList())
         wrong = []
         for i, name in enumerate(self.ids):
             if name not in present:
                 wrong.append(f"train {name} was not inserted on edge {self.line.edges[start.edge[i]]}")
                 continue
-            edge, where = libsumo.vehicle.getRoadID(name), libsumo.vehicle.getLanePosition(name)
-            speed = libsumo.vehicle.getSpeed(name)
+            edge, where = self.api.vehicle.getRoadID(name), self.api.vehicle.getLanePosition(name)
+            speed = self.api.vehicle.getSpeed(name)
             if edge != self.line.edges[start.edge[i]] or abs(where - start.lane_position[i]) > TOLERANCE_M:
                 wanted = f"{self.line.edges[start.edge[i]]} at {start.lane_position[i]:.6f} m"
                 wrong.append(f"train {name} was inserted on {edge} at {where:.6f} m instead of {wanted}")
@@ -142,14 +154,14 @@ class Sumo:
         return self.seen
 
     def _read(self) -> Seen:
-        road, lane_position = libsumo.vehicle.getRoadID, libsumo.vehicle.getLanePosition
+        road, lane_position = self.api.vehicle.getRoadID, self.api.vehicle.getLanePosition
         edge: Ints = np.empty(len(self.ids), np.int64)
         position: Floats = np.empty(len(self.ids))
         try:
             for i, name in enumerate(self.ids):
                 edge[i] = self.index[road(name)]
                 position[i] = lane_position(name)
-        except (libsumo.TraCIException, KeyError) as error:
+        except (self.api.TraCIException, KeyError) as error:
             raise CouplingError(
                 f"train {name} is not on the line at {self._time():.3f} s: {error}; did it reach the line's end?"
             ) from None
@@ -158,15 +170,18 @@ class Sumo:
 
     def route(self, train: int, edges: tuple[str, ...]) -> None:
         """Give a train another route."""
-        self._call(libsumo.vehicle.setRoute, self.ids[train], list(edges))
+        self._call(self.api.vehicle.setRoute, self.ids[train], list(edges))
+
+    def linked(self, links: Links, formation: Ints) -> None:
+        """Nobody looks."""
 
     def move(self, displacement: Floats, step: float) -> None:
         """Command the mean speed of the step, displacement / T: SUMO's Euler update then moves the train by just that."""
-        command = libsumo.vehicle.setSpeed
+        command = self.api.vehicle.setSpeed
         before = self.seen.position
         for name, speed in zip(self.ids, (displacement / step).tolist(), strict=True):
             command(name, speed)
-        self._call(libsumo.simulationStep)
+        self._call(self.api.simulationStep)
         now = self.seen = self._read()
         wrong = np.flatnonzero(np.abs(now.position - before - displacement) > TOLERANCE_M)
         if len(wrong):
@@ -176,11 +191,11 @@ class Sumo:
         name, edge = self.ids[i], self.line.edges[now.edge[i]]
         moved = now.position[i] - before[i]
         cause = "unknown"
-        if libsumo.vehicle.getSpeedMode(name) != SPEED_MODE_FREE:
-            cause = f"its speed mode is {libsumo.vehicle.getSpeedMode(name)}, not {SPEED_MODE_FREE}: SUMO corrects its speed"
-        elif name in libsumo.simulation.getStartingTeleportIDList() or name in libsumo.simulation.getEndingTeleportIDList():
+        if self.api.vehicle.getSpeedMode(name) != SPEED_MODE_FREE:
+            cause = f"its speed mode is {self.api.vehicle.getSpeedMode(name)}, not {SPEED_MODE_FREE}: SUMO corrects its speed"
+        elif name in self.api.simulation.getStartingTeleportIDList() or name in self.api.simulation.getEndingTeleportIDList():
             cause = "a teleport"
-        elif libsumo.vehicle.isStopped(name):
+        elif self.api.vehicle.isStopped(name):
             cause = "a stop"
         elif moved < 1e-9:
             cause = "it was held"
@@ -193,7 +208,7 @@ class Sumo:
         """End the simulation; SUMO then completes its logs."""
         if self.began:
             self.began = False
-            libsumo.close()
+            self.api.close()
 
     def messages(self) -> list[tuple[float | None, str]]:
         """Warnings and errors SUMO wrote, with the time it named, if any."""
@@ -208,12 +223,12 @@ class Sumo:
         return found
 
     def _time(self) -> float:
-        return float(libsumo.simulation.getTime()) - self.time_step
+        return float(self.api.simulation.getTime()) - self.time_step
 
     def _call(self, function: Any, *arguments: Any) -> Any:
         """Libsumo's own errors in the project's words."""
         try:
             return function(*arguments)
-        except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
+        except (self.api.TraCIException, self.api.FatalTraCIError) as error:
             where = f" at {self._time():.3f} s" if self.began and libsumo.simulation.isLoaded() else ""
             raise SimulatorError(f"SUMO{where}: {error}") from None
