@@ -27,6 +27,9 @@ SPEED_MODE_FREE = 32
 #: What SUMO adds in one step is exact to rounding; anything beyond was somebody else.
 TOLERANCE_M = 1e-6
 
+#: Closer than this to the end of its edge a train may be on the next one.
+NEAR_M = 1e-3
+
 OPTIONS = {
     "time-to-teleport": "-1",  # a train held at speed 0 would teleport after 300 s
     "collision.action": "warn",  # the default removes the train; gaps are the monitors' business
@@ -122,7 +125,9 @@ class Sumo:
         for name in self.ids:
             vehicle.setSpeedMode(name, SPEED_MODE_FREE)
             vehicle.setLaneChangeMode(name, 0)
-        self.seen = self._read()
+        everyone = np.arange(len(self.ids))
+        edge = self._edges(everyone)
+        self.seen = Seen(self.line.start_m[edge] + self._lane_positions(), edge)
 
     def _ready(self) -> None:
         """Whether SUMO can be started at all."""
@@ -153,19 +158,40 @@ class Sumo:
         """Front positions on the line and edges."""
         return self.seen
 
-    def _read(self) -> Seen:
-        road, lane_position = self.api.vehicle.getRoadID, self.api.vehicle.getLanePosition
-        edge: Ints = np.empty(len(self.ids), np.int64)
-        position: Floats = np.empty(len(self.ids))
+    def _lane_positions(self) -> Floats:
+        return np.fromiter(map(self.api.vehicle.getLanePosition, self.ids), np.float64, len(self.ids))
+
+    def _edges(self, trains: Ints) -> Ints:
+        """The edges these trains are on, asked one by one."""
+        road = self.api.vehicle.getRoadID
+        found = np.empty(len(trains), np.int64)
+        for k, i in enumerate(trains.tolist()):
+            try:
+                found[k] = self.index[road(self.ids[i])]
+            except (self.api.TraCIException, KeyError) as error:
+                raise CouplingError(
+                    f"train {self.ids[i]} is not on the line at {self._time():.3f} s: {error}; did it reach the line's end?"
+                ) from None
+        return found
+
+    def _read(self, wanted: Floats) -> Seen:
+        """Where the trains are that should be at ``wanted`` (n,), with one call per train.
+
+        A train that is where it should be, and not near the end of its edge, is on the edge it was on.
+        """
+        line, edge = self.line, self.seen.edge
         try:
-            for i, name in enumerate(self.ids):
-                edge[i] = self.index[road(name)]
-                position[i] = lane_position(name)
-        except (self.api.TraCIException, KeyError) as error:
-            raise CouplingError(
-                f"train {name} is not on the line at {self._time():.3f} s: {error}; did it reach the line's end?"
-            ) from None
-        position += self.line.start_m[edge]
+            lane_position = self._lane_positions()
+        except self.api.TraCIException:
+            self._edges(np.arange(len(self.ids)))  # tells which train
+            raise
+        position = line.start_m[edge] + lane_position
+        at_the_end = wanted > line.start_m[edge] + line.length_m[edge] - NEAR_M
+        ask = np.flatnonzero(at_the_end | ~(np.abs(position - wanted) <= TOLERANCE_M))
+        if len(ask):
+            edge = edge.copy()
+            edge[ask] = self._edges(ask)
+            position[ask] = line.start_m[edge[ask]] + lane_position[ask]
         return Seen(position, edge)
 
     def route(self, train: int, edges: tuple[str, ...]) -> None:
@@ -177,15 +203,18 @@ class Sumo:
 
     def move(self, displacement: Floats, step: float) -> None:
         """Command the mean speed of the step, displacement / T: SUMO's Euler update then moves the train by just that."""
-        command = self.api.vehicle.setSpeed
         before = self.seen.position
-        for name, speed in zip(self.ids, (displacement / step).tolist(), strict=True):
-            command(name, speed)
+        self._call(self._command, (displacement / step).tolist())
         self._call(self.api.simulationStep)
-        now = self.seen = self._read()
+        now = self.seen = self._read(before + displacement)
         wrong = np.flatnonzero(np.abs(now.position - before - displacement) > TOLERANCE_M)
         if len(wrong):
             raise CouplingError("; ".join(self._explain(int(i), now, before, displacement) for i in wrong[:5]))
+
+    def _command(self, speeds: list[float]) -> None:
+        set_speed = self.api.vehicle.setSpeed
+        for name, speed in zip(self.ids, speeds, strict=True):
+            set_speed(name, speed)
 
     def _explain(self, i: int, now: Seen, before: Floats, displacement: Floats) -> str:
         name, edge = self.ids[i], self.line.edges[now.edge[i]]

@@ -1,0 +1,430 @@
+"""What closing the loop costs beside SUMO alone: one command, one run, side by side.
+
+``python tools/bench.py`` prints a table, ``--json`` a list of rows; ``--trains 1000`` keeps to one size. Every case is a process
+of its own, since libsumo holds one simulation per process; the cases take turns, so that a busy machine slows all of them alike,
+and the median of the repeats is told.
+
+=================  ===============================================================================================================
+bare               SUMO stepping the trains at a constant commanded speed
+rail               SUMO's own ``Rail`` model drives the same trains on the same net
+loop               ours: ``fully_distributed`` on point trains, everything recorded
+traci              the same loop through TraCI, SUMO in a process of its own
+coupled_units      numeric: ``fully_distributed`` on trains of four units, sub-steps of 10 ms
+finite_time        numeric: ``emu_finite_time`` on the same trains
+actuated_units     numeric: ``fault_tolerant`` with its observer on trains of four units with actuators
+=================  ===============================================================================================================
+
+The net is fixed: three parallel tracks cut into edges of 5 km, ``bench_three_tracks``, as long as the trains need. The outputs of
+SUMO are those of a run (``trainctl.sumo.session.OPTIONS``) in bare, rail, loop and traci. A figure is the time from the first step
+until the logs are closed, per train and step [us]; ``peak_mb`` is the peak resident memory of the process that steps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+SIZES = (10, 100, 1000, 10_000)
+IN_SUMO = ("bare", "rail", "loop", "traci")
+NUMERIC = ("coupled_units", "finite_time", "actuated_units")
+PARTS = ("read", "topology", "control", "plant", "write", "step", "record")
+SPEED_MPS = 80.0
+SPACING_M = dict.fromkeys((*IN_SUMO, *NUMERIC), 500.0) | {"finite_time": 900.0, "actuated_units": 900.0}
+
+#: Train-steps of one repeat, about; the slower a case, the fewer.
+WORK = {"traci": 15_000, "coupled_units": 30_000, "finite_time": 30_000, "actuated_units": 15_000}
+IN_SUMO_WORK = 300_000
+
+
+def steps_of(case: str, trains: int) -> int:
+    """Steps of one repeat."""
+    most = 2000 if case in IN_SUMO else 100
+    return min(most, max(10, WORK.get(case, IN_SUMO_WORK) // trains))
+
+
+# Scenarios
+
+
+def scenario(case: str, trains: int, steps: int) -> tuple[str, str]:
+    """TOML of the scenario and of its line: trains take turns on the tracks, a little off their slots."""
+    spacing, rows = SPACING_M[case], -(-trains // 3)
+    slots = case in ("finite_time", "actuated_units")  # these laws want one slot per train, whatever its track
+    front = 1000.0 + (trains if slots else rows) * spacing
+    line = (
+        f'name = "bench_three_tracks"\ntracks = [2, 1, 3]\nlength_m = {front + 100.0 * (steps + 2) + 5000.0}\nstart_m = 0.0\n'
+        "max_edge_m = 5000.0\nspeed = [[0.0, 100.0]]\n"
+    )
+    body = [
+        'schema_version = 1\ntitle = "Bench"',
+        f"[run]\nduration_s = {steps}\nstep_s = 1.0\nsub_step_s = 0.01",
+        '[network]\nline = "line.toml"',
+        _LAWS.get(case, _LAWS["loop"]),
+    ]
+    for i in range(trains):
+        wiggle = (i * 7919 % 201 - 100) / 100.0  # -1 .. 1, the same everywhere
+        position = front - (i if slots else i // 3) * spacing + 20.0 * wiggle
+        speed = SPEED_MPS + (i * 104_729 % 201 - 100) / 100.0
+        track = (1, 2, 3)[i // rows if slots else i % 3]
+        body.append(f'[[train]]\nid = {i + 1}\ntype = "train"\ntrack = {track}\nposition_m = {position}\nspeed_mps = {speed}')
+    return "\n".join(body) + "\n", line
+
+
+_DAVIS = "c0_n_per_kg = 1.176e-2\nc1_ns_per_m_kg = 7.7616e-4\nc2_ns2_per_m2_kg = 1.6e-5\n"
+_COUPLERS = "coupler_stiffness_n_per_m = 1.6e5\ncoupler_damping_ns_per_m = 600.0\n"
+_EMU = f"[train_type.train]\nunits = 4\nunit_length_m = 80.0\nunit_mass_kg = 80000.0\n{_DAVIS}{_COUPLERS}"
+_LAWS = {
+    "loop": f"""
+[controller]
+law = "fully_distributed"
+[plant]
+kind = "point"
+[reference]
+speed_mps = {SPEED_MPS}
+[bounds]
+speed_lower_mps = 75.0
+speed_upper_mps = 85.0
+input_lower_mps2 = -11.0
+input_upper_mps2 = 11.0
+[topology]
+desired = "equal"
+spacing_m = {SPACING_M["loop"]}
+lower_m = 100.0
+upper_m = 1500.0
+[train_type.train]
+unit_mass_kg = 320000.0
+{_DAVIS}""",
+    "coupled_units": f"""
+[controller]
+law = "fully_distributed"
+eta = "own_speed"
+[plant]
+kind = "coupled_units"
+[reference]
+speed_mps = {SPEED_MPS}
+[bounds]
+speed_lower_mps = 75.0
+speed_upper_mps = 85.0
+[topology]
+desired = "equal"
+spacing_m = {SPACING_M["loop"]}
+lower_m = 330.0
+upper_m = 1500.0
+{_EMU}""",
+    "finite_time": f"""
+[controller]
+law = "emu_finite_time"
+emergency_distance_m = 200.0
+emergency_zone_m = 100.0
+[plant]
+kind = "coupled_units"
+[reference]
+speed_mps = {SPEED_MPS}
+[topology]
+desired = "slots"
+spacing_m = {SPACING_M["finite_time"]}
+lower_m = 520.0
+{_EMU}""",
+    "actuated_units": f"""
+[controller]
+law = "fault_tolerant"
+leader_error_lower_m = -500.0
+leader_error_upper_m = 500.0
+[observer]
+kind = "asymptotic"
+fault_constant_n_per_s = 2e5
+fault_sinusoids = [[1.0, 2e5]]
+[plant]
+kind = "actuated_units"
+[reference]
+speed_mps = {SPEED_MPS}
+[topology]
+desired = "slots"
+spacing_m = {SPACING_M["actuated_units"]}
+lower_m = 400.0
+upper_m = 1400.0
+[train_type.train]
+units = 4
+unit_length_m = 26.0
+unit_mass_kg = 80000.0
+actuator_rate_per_s = 50.0
+{_DAVIS}{_COUPLERS}""",
+}
+
+
+# One case, in a process of its own
+
+
+class Clock:
+    """Exclusive time of each part: what runs inside another part is not that part's."""
+
+    def __init__(self) -> None:
+        self.spent = dict.fromkeys(PARTS, 0.0)
+        self.open: list[str] = []
+        self.since = 0.0
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """Count the time inside as that of ``name``."""
+        self._switch()
+        self.open.append(name)
+        try:
+            yield
+        finally:
+            self._switch()
+            self.open.pop()
+
+    def _switch(self) -> None:
+        now = time.perf_counter()
+        if self.open:
+            self.spent[self.open[-1]] += now - self.since
+        self.since = now
+
+    def around(self, owner: Any, name: str, part: str) -> None:
+        """Let a function of a module or an object count as ``part``."""
+        function = getattr(owner, name)
+
+        def timed(*arguments: Any, **more: Any) -> Any:
+            with self.part(part):
+                return function(*arguments, **more)
+
+        setattr(owner, name, timed)
+
+
+def peak_mb() -> float:
+    """Peak resident memory of this process [MB]."""
+    text = Path("/proc/self/status").read_text(encoding="ascii")
+    return next(int(row.split()[1]) / 1024.0 for row in text.splitlines() if row.startswith("VmHWM"))
+
+
+def inputs(folder: Path, case: str, trains: int, steps: int) -> None:
+    """Write what SUMO alone needs into ``folder``: net, trains and configuration, as a run does."""
+    import sumo_net
+    from trainctl.loop import Simulation
+    from trainctl.prepare import open_scenario
+    from trainctl.record.journal import Journal
+    from trainctl.sumo.session import LOGS, write_configuration, write_routes
+    from trainctl.world import Numeric
+
+    prepared = open_scenario(str(folder / "scenario.toml"))
+    sumo_net.build(prepared.spec, folder)
+
+    class Writer(Numeric):
+        def start(self, start: Any) -> None:
+            write_routes(start, folder / "trains.rou.xml")
+
+    Simulation(prepared, Writer(prepared.line), Journal(folder, prepared))
+    configuration = write_configuration(folder, f"{prepared.spec.name}.net.xml", "trains.rou.xml", 1.0, steps + 1.0)
+    logs = [part for key, name in LOGS.items() for part in (f"--{key}", str(folder / name))]
+    (folder / "command.json").write_text(json.dumps(["sumo", "-c", str(configuration), *logs]), encoding="utf-8")
+    if case == "rail":
+        routes = folder / "trains.rou.xml"
+        text = routes.read_text(encoding="utf-8")
+        own = text[text.index('minGap="0"') : text.index("/>", text.index("<vType"))]
+        routes.write_text(text.replace(own, 'minGap="0" sigma="0" carFollowModel="Rail" trainType="ICE3"'), encoding="utf-8")
+
+
+def alone(folder: Path, case: str, steps: int) -> dict[str, Any]:
+    """SUMO without a loop: bare or rail."""
+    import libsumo
+
+    libsumo.start(json.loads((folder / "command.json").read_text(encoding="utf-8")))
+    libsumo.simulationStep()
+    names = libsumo.vehicle.getIDList()
+    if case == "bare":
+        for name in names:
+            libsumo.vehicle.setSpeedMode(name, 32)
+            libsumo.vehicle.setLaneChangeMode(name, 0)
+            libsumo.vehicle.setSpeed(name, SPEED_MPS)
+    began = time.perf_counter()
+    for _ in range(steps):
+        libsumo.simulationStep()
+    libsumo.close()
+    spent = time.perf_counter() - began
+    return {"trains": len(names), "seconds": [spent], "parts": {"step": spent}, "peak_mb": peak_mb()}
+
+
+def closed(folder: Path, case: str, steps: int) -> dict[str, Any]:
+    """Our loop: in SUMO, through TraCI, or numeric."""
+    if case == "traci":
+        sys.modules["libsumo"] = through_traci()
+    from trainctl.loop import Simulation
+    from trainctl.prepare import open_scenario
+    from trainctl.record.journal import Journal
+    from trainctl.runner import open_world
+
+    prepared = open_scenario(str(folder / "scenario.toml"))
+    clock = Clock()
+    journal = Journal(folder, prepared)
+    world: Any = open_world(prepared, folder, "sumo" if case in IN_SUMO else "numeric")
+    simulation = Simulation(prepared, world, journal)
+    simulation.step()  # compiles or loads what the kernels need
+    clock.around(simulation, "_measure", "read")
+    clock.around(simulation, "_topology", "topology")
+    clock.around(simulation, "_control", "control")
+    clock.around(simulation.motion, "advance", "plant")
+    clock.around(simulation, "_check", "plant")
+    clock.around(simulation, "_record", "record")
+    clock.around(world, "move", "write")
+    if case in IN_SUMO:
+        import libsumo
+
+        clock.around(world, "_read", "read")
+        clock.around(libsumo, "simulationStep", "step")
+    repeats = 1 if case in IN_SUMO else 3
+    seconds = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        for _ in range(max(1, steps // repeats)):
+            simulation.step()
+        seconds.append(time.perf_counter() - began)
+    began = time.perf_counter()
+    with clock.part("step"):
+        world.close()
+    with clock.part("record"):
+        journal.close()
+    ended = time.perf_counter() - began
+    count = repeats * max(1, steps // repeats)
+    seconds = [repeats * s + ended for s in seconds]
+    return {
+        "trains": len(prepared.scenario.ids), "steps": count, "seconds": seconds, "parts": clock.spent, "peak_mb": peak_mb(),
+    }  # fmt: skip
+
+
+def through_traci() -> Any:
+    """A stand-in for the module libsumo that goes through TraCI."""
+    import types
+
+    import traci
+    from sumo import SUMO_HOME
+
+    shim: Any = types.ModuleType("libsumo")
+    shim.vehicle, shim.TraCIException, shim.FatalTraCIError = traci.vehicle, traci.TraCIException, traci.FatalTraCIError
+
+    class Domain:
+        def __getattr__(self, name: str) -> Any:
+            return getattr(traci.simulation, name)
+
+        def isLoaded(self) -> bool:
+            return bool(traci.isLoaded())
+
+    def start(command: list[str]) -> None:
+        os.environ["SUMO_HOME"] = SUMO_HOME
+        traci.start([os.path.join(SUMO_HOME, "bin", "sumo"), *command[1:]], stdout=subprocess.DEVNULL)
+
+    shim.simulation, shim.start, shim.simulationStep, shim.close = Domain(), start, traci.simulationStep, traci.close
+    return shim
+
+
+def child(case: str, folder: Path, steps: int) -> None:
+    """What runs in a process of its own; prints one JSON object."""
+    function: Callable[..., dict[str, Any]] = alone if case in ("bare", "rail") else closed
+    print(json.dumps(function(folder, case, steps)))
+
+
+# All cases
+
+
+def python(*arguments: str) -> str:
+    """Run this file in a process of its own."""
+    command = [sys.executable, __file__, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"{' '.join(arguments)} failed:\n{done.stderr}")
+    return done.stdout
+
+
+def measure(case: str, trains: int) -> dict[str, Any]:
+    """One repeat of one case."""
+    steps = steps_of(case, trains)
+    with tempfile.TemporaryDirectory(prefix="trainctl-bench-") as place:
+        folder = Path(place)
+        text, line = scenario(case, trains, steps + 2)
+        (folder / "scenario.toml").write_text(text, encoding="utf-8")
+        (folder / "line.toml").write_text(line, encoding="utf-8")
+        if case in ("bare", "rail"):
+            python("--inputs", case, str(folder), str(trains), str(steps))
+        result: dict[str, Any] = json.loads(python("--case", case, str(folder), str(steps)).splitlines()[-1])
+    return {"steps": steps, **result}
+
+
+def bench(sizes: list[int], cases: list[str], repeats: int) -> list[dict[str, Any]]:
+    """Rows of all cases at all sizes, the cases taking turns."""
+    rows = []
+    for trains in sizes:
+        found: dict[str, list[dict[str, Any]]] = {case: [] for case in cases}
+        for turn in range(repeats):
+            for case in cases:
+                if turn == 0 or case in IN_SUMO:  # the numeric ones repeat within one process
+                    print(f"{trains} trains, {case}, {turn + 1}", file=sys.stderr)
+                    found[case].append(measure(case, trains))
+        rows += [row(case, trains, results) for case, results in found.items()]
+        bare = next((r["us_per_train_step"] for r in rows if r["case"] == "bare" and r["trains"] == trains), None)
+        for r in rows:
+            if r["trains"] == trains:
+                r["ratio_to_bare"] = round(r["us_per_train_step"] / bare, 3) if bare else None
+    return rows
+
+
+def row(case: str, trains: int, results: list[dict[str, Any]]) -> dict[str, Any]:
+    """Medians of the repeats."""
+    scale = 1e6 / trains
+    times = sorted(s * scale / r["steps"] for r in results for s in r["seconds"])
+    typical = statistics.median(times)
+    return {
+        "case": case, "trains": trains, "us_per_train_step": round(typical, 3), "ratio_to_bare": None,
+        "least_us": round(times[0], 3), "most_us": round(times[-1], 3),
+        "times_real_time": round(1e6 / (typical * trains), 1),
+        "peak_mb": round(max(r["peak_mb"] for r in results), 1),
+        **{f"{part}_us": round(statistics.median(r["parts"].get(part, 0.0) * scale / r["steps"] for r in results), 3) for part in PARTS},
+    }  # fmt: skip
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Rows in columns, with how the cost grows with the number of trains."""
+    columns = ["case", "trains", "us_per_train_step", "ratio_to_bare", "times_real_time", "peak_mb", *(f"{p}_us" for p in PARTS)]
+    heads = ["case", "trains", "us/train-step", "to bare", "x real time", "peak MB", *PARTS]
+    lines = [heads, *([("" if r[c] is None else str(r[c])) for c in columns] for r in rows)]
+    width = [max(len(line[k]) for line in lines) for k in range(len(heads))]
+    text = [
+        "  ".join(c.ljust(w) if k == 0 else c.rjust(w) for k, (c, w) in enumerate(zip(line, width, strict=True))) for line in lines
+    ]
+    for case in dict.fromkeys(r["case"] for r in rows):
+        own = {r["trains"]: r["us_per_train_step"] for r in rows if r["case"] == case}
+        if {100, 10_000} <= own.keys():
+            text.append(f"{case}: cost per train-step grows {own[10_000] / own[100]:.2f} times from 100 to 10000 trains")
+    return "\n".join(text)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description="What closing the loop costs beside SUMO alone.")
+    parser.add_argument("--trains", type=int, action="append", help="number of trains; repeatable; default 10, 100, 1000, 10000")
+    parser.add_argument("--only", action="append", choices=[*IN_SUMO, *NUMERIC], help="this case; repeatable; default all")
+    parser.add_argument("--repeats", type=int, default=3, help="repeats of each case; the median is told")
+    parser.add_argument("--json", action="store_true", help="print a list of rows for machines")
+    parser.add_argument("--case", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--inputs", nargs=4, help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    if asked.inputs:
+        case, folder, trains, steps = asked.inputs
+        inputs(Path(folder), case, int(trains), int(steps))
+    elif asked.case:
+        case, folder, steps = asked.case
+        child(case, Path(folder), int(steps))
+    else:
+        rows = bench(asked.trains or list(SIZES), asked.only or [*IN_SUMO, *NUMERIC], asked.repeats)
+        print(json.dumps(rows, indent=2) if asked.json else table(rows))
+
+
+if __name__ == "__main__":
+    main()
