@@ -1,0 +1,298 @@
+"use strict";
+(() => {
+  const data = JSON.parse(document.getElementById("data").textContent);
+  const at = (id) => document.getElementById(id);
+  const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  const floats = (packed) => new Float32Array(bytes(packed.bdata).buffer);
+
+  // ---- plots -------------------------------------------------------------------------------------------------------------------
+  const plots = [];
+  const whole = [data.animation.time[0], data.animation.time[data.animation.time.length - 1]];
+  let range = whole.slice();
+  const isDark = () => {
+    const stated = document.documentElement.dataset.theme;
+    return stated ? stated === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+  };
+  // black and the darkest blue do not show on a dark page
+  const shown = (color) => (color === "ink" || color === "#000000") ? css("--ink") : (isDark() && color === "#0072B2") ? "#4aa3df" : color;
+  const faint = (color) => { const c = shown(color); return c.startsWith("#") && c.length === 7 ? c + "2e" : c; };
+
+  function traces(panel) {
+    const many = panel.traces.filter((t) => !t.band).length > 60;
+    return panel.traces.map((t) => t.points
+      ? { type: "scatter", mode: "markers", x: t.x, y: t.y, text: t.text, name: t.name, marker: { color: shown(t.color), size: 9, symbol: "diamond" }, hovertemplate: "%{x:g} s: %{y}<br>%{text}<extra></extra>" }
+      : {
+        type: "scatter", mode: "lines", x: t.x, y: t.y, name: t.name, legendgroup: t.group, connectgaps: false, opacity: t.alpha || 1,
+        line: { color: shown(t.color), width: t.band ? 0 : many ? 0.8 : 1.6, dash: t.dash || "solid", shape: t.step ? "hv" : "linear" },
+        fill: t.fill ? "tonexty" : "none", fillcolor: t.fill ? faint(t.color) : undefined, showlegend: !t.band && !many,
+        hoverinfo: t.band ? "skip" : undefined, hovertemplate: t.band ? undefined : "%{y:.6~g}",
+      });
+  }
+
+  function layout(panel) {
+    const grid = css("--line"), soft = css("--soft");
+    const bounds = panel.bounds || [];
+    const axis = { gridcolor: grid, zerolinecolor: grid, linecolor: soft, tickcolor: soft };
+    const y = { ...axis, title: { text: panel.unit, standoff: 10 }, exponentformat: "power" };
+    if (panel.log) Object.assign(y, { type: "log", range: panel.log });
+    if (panel.categories) Object.assign(y, { type: "category", title: undefined });
+    return {
+      height: panel.categories ? 110 + 30 * panel.traces.length : 320, margin: { l: 92, r: 176, t: 30, b: 40 }, modebar: { bgcolor: "rgba(0,0,0,0)", color: soft, activecolor: css("--accent") }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+      font: { color: css("--ink"), size: 12, family: "system-ui, DejaVu Sans, sans-serif" }, hovermode: panel.categories ? "closest" : "x unified",
+      hoverlabel: { bgcolor: css("--paper"), bordercolor: grid, font: { color: css("--ink") } }, legend: { font: { size: 11 }, itemsizing: "constant", traceorder: "grouped", tracegroupgap: 4 },
+      showlegend: !panel.categories, xaxis: { ...axis, title: { text: "time [s]", standoff: 4 }, range: range.slice(), hoverformat: ".6~g" }, yaxis: y, dragmode: "zoom",
+      shapes: bounds.map((b) => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: b.value, y1: b.value, line: { color: b.dash === "dot" ? css("--ink") : css("--bad"), width: 1.2, dash: b.dash } })),
+      annotations: bounds.map((b) => ({ xref: "paper", x: 1, xanchor: "right", y: b.value, yanchor: "bottom", showarrow: false, text: `${b.name} ${+b.value.toPrecision(6)}`, font: { size: 10, color: b.dash === "dot" ? css("--ink") : css("--bad") } })),
+    };
+  }
+
+  // plotly leaves shapes out of the automatic range: an unseen pair of points at the bounds brings them in
+  function anchors(panel) {
+    const values = (panel.bounds || []).map((b) => b.value);
+    if (panel.least_range && !values.length) values.push(-panel.least_range / 2, panel.least_range / 2);
+    return values.length ? [{ type: "scatter", mode: "markers", x: values.map(() => whole[0]), y: values, marker: { opacity: 0, size: 1 }, hoverinfo: "skip", showlegend: false }] : [];
+  }
+
+  const options = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], toImageButtonOptions: { format: "svg" } };
+  for (const panel of data.panels) {
+    const box = document.createElement("figure");
+    box.className = "plot"; box.id = "plot-" + panel.id; box.tabIndex = 0; box.setAttribute("role", "group"); box.setAttribute("aria-label", panel.title + ", " + panel.unit);
+    box.style.marginLeft = box.style.marginRight = 0;
+    const head = document.createElement("figcaption"), title = document.createElement("h3"), note = document.createElement("span");
+    title.textContent = panel.title; note.className = "about"; note.textContent = panel.note || "";
+    head.append(title, note);
+    const draw = document.createElement("div"); draw.className = "draw";
+    const cursor = document.createElement("div"); cursor.className = "cursor";
+    box.append(head, draw, cursor);
+    at("plots").append(box);
+    plots.push({ panel, box, draw, cursor });
+    box.addEventListener("keydown", (event) => keys(event));
+  }
+
+  let drawn = 0;
+  function redraw() { return Promise.all(plots.map((p) => Plotly.react(p.draw, [...traces(p.panel), ...anchors(p.panel)], layout(p.panel), options))); }
+  function draw_next() { // one plot per turn, so that the page answers while the rest is drawn
+    if (drawn === plots.length) { document.documentElement.dataset.ready = "yes"; cursors(); return; }
+    const p = plots[drawn++];
+    Plotly.newPlot(p.draw, [...traces(p.panel), ...anchors(p.panel)], layout(p.panel), options).then(() => {
+      p.draw.on("plotly_relayout", (change) => linked(p, change));
+      p.draw.on("plotly_click", (hit) => { if (hit.points.length) go_to_time(hit.points[0].x); });
+      setTimeout(draw_next, 0);
+    });
+  }
+
+  let busy = false;
+  function linked(source, change) {
+    if (busy) return;
+    if (change["xaxis.autorange"]) show_times(whole);
+    else if ("xaxis.range[0]" in change) show_times([change["xaxis.range[0]"], change["xaxis.range[1]"]]);
+    else if (change["xaxis.range"]) show_times(change["xaxis.range"]);
+    else cursors();
+  }
+  async function show_times(wanted) {
+    const span = whole[1] - whole[0] || 1;
+    const low = Math.max(wanted[0], whole[0] - 0.02 * span), high = Math.min(wanted[1], whole[1] + 0.02 * span);
+    range = high > low ? [low, high] : whole.slice();
+    busy = true;
+    await Promise.all(plots.slice(0, drawn).map((p) => Plotly.relayout(p.draw, { "xaxis.range": range.slice() })));
+    busy = false;
+    cursors();
+  }
+  function keys(event) {
+    const span = range[1] - range[0], middle = (range[0] + range[1]) / 2;
+    const wanted = { "+": [middle - span / 4, middle + span / 4], "=": [middle - span / 4, middle + span / 4], "-": [middle - span, middle + span], "0": whole,
+      ArrowLeft: [range[0] - span / 5, range[1] - span / 5], ArrowRight: [range[0] + span / 5, range[1] + span / 5] }[event.key];
+    if (wanted && !event.ctrlKey && !event.metaKey) { event.preventDefault(); event.stopPropagation(); show_times(wanted); }
+  }
+  at("all").addEventListener("click", () => show_times(whole));
+
+  function cursors() {
+    for (const p of plots.slice(0, drawn)) {
+      const full = p.draw._fullLayout, x = full && full.xaxis;
+      if (!x || !x._length) continue;
+      const share = (now - x.range[0]) / (x.range[1] - x.range[0]), inside = share >= 0 && share <= 1;
+      p.cursor.style.display = inside ? "block" : "none";
+      p.cursor.style.left = p.draw.offsetLeft + x._offset + share * x._length + "px";
+      p.cursor.style.top = p.draw.offsetTop + full.yaxis._offset + "px";
+      p.cursor.style.height = full.yaxis._length + "px";
+    }
+  }
+
+  // ---- tracks ------------------------------------------------------------------------------------------------------------------
+  const film = data.animation, times = film.time, count = film.trains.length, couples = film.pairs.length;
+  const position = floats(film.position), lateral = floats(film.lateral), speed = floats(film.speed), links = bytes(film.links);
+  const canvas = at("view"), pen = canvas.getContext("2d"), slider = at("slider");
+  let frame = 0, now = times[0], playing = false, last = 0;
+  const height = 72 + 46 * Math.max(film.tracks.length, 1);
+  slider.max = times.length - 1;
+  film.trains.forEach((train, k) => at("follow").add(new Option("train " + train.name, k)));
+
+  // the stretch shown is as long as the longest the trains ever took, so that nothing jumps while playing
+  let reach = 1000;
+  for (let f = 0; f < times.length; f++) {
+    let low = Infinity, high = -Infinity;
+    for (let k = 0; k < count; k++) { const x = position[f * count + k]; if (x < low) low = x; if (x > high) high = x; }
+    if (high - low > reach) reach = high - low;
+  }
+  reach *= 1.12;
+
+  function place(k, share) { // of train k between this frame and the next
+    const a = frame * count + k, b = a + count;
+    if (Number.isNaN(position[a])) return null;
+    const blend = (from) => share > 0 && frame + 1 < times.length && !Number.isNaN(position[b]) ? from[a] + share * (from[b] - from[a]) : from[a];
+    return { x: blend(position), side: blend(lateral), v: speed[a] };
+  }
+
+  function paint(share) {
+    const ratio = devicePixelRatio || 1, width = canvas.clientWidth;
+    if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
+      canvas.width = Math.round(width * ratio); canvas.height = Math.round(height * ratio); canvas.style.height = height + "px";
+    }
+    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+    pen.clearRect(0, 0, width, height);
+    const here = film.trains.map((_, k) => place(k, share));
+    const present = here.filter((p) => p);
+    if (!present.length) return;
+    const chosen = +at("follow").value;
+    const xs = present.map((p) => p.x);
+    const centre = chosen >= 0 && here[chosen] ? here[chosen].x : (Math.min(...xs) + Math.max(...xs)) / 2;
+    const span = reach / Math.pow(2, +at("zoom").value), left = 64, room = width - left - 16;
+    const px = (x) => left + ((x - centre) / span + 0.5) * room, py = (side) => 62 + 46 * side;
+    const ink = css("--ink"), soft = css("--soft"), line = css("--line"), accent = css("--accent");
+    pen.font = "12px system-ui, DejaVu Sans, sans-serif"; pen.textBaseline = "middle";
+
+    // kilometrage
+    let step = Math.pow(10, Math.floor(Math.log10(span / 5)));
+    step *= span / step > 25 ? 5 : span / step > 12 ? 2 : 1;
+    pen.textAlign = "center"; pen.lineWidth = 1;
+    for (let x = Math.ceil((centre - span / 2) / step) * step; x < centre + span / 2; x += step) {
+      pen.strokeStyle = line; pen.beginPath(); pen.moveTo(px(x), 34); pen.lineTo(px(x), height - 26); pen.stroke();
+      pen.fillStyle = soft; pen.fillText(+(x / 1000).toFixed(3) + " km", px(x), height - 13);
+    }
+    pen.save(); pen.beginPath(); pen.rect(left - 8, 0, width, height); pen.clip();
+    pen.strokeStyle = css("--track"); pen.lineWidth = 2;
+    film.tracks.forEach((_, k) => { pen.beginPath(); pen.moveTo(left, py(k)); pen.lineTo(width - 12, py(k)); pen.stroke(); });
+    for (const [a, b, from, to] of film.crossovers) {
+      if (px(b) < left || px(a) > width) continue;
+      pen.beginPath(); pen.moveTo(px(a), py(from)); pen.lineTo(px(b), py(to)); pen.stroke();
+    }
+
+    // links: arcs above the trains; heads of arrows where only one of both hears
+    const mutual = new Map();
+    for (let c = 0; c < couples; c++) if (links[frame * couples + c]) mutual.set(film.pairs[c].join(), links[frame * couples + c]);
+    for (const [key, state] of mutual) {
+      const [sender, receiver] = key.split(",").map(Number), back = mutual.get([receiver, sender].join());
+      if (back && sender > receiver) continue;
+      const a = here[sender], b = here[receiver];
+      if (!a || !b) continue;
+      const heard = state === 2 && (!back || back === 2);
+      pen.strokeStyle = accent; pen.fillStyle = accent; pen.lineWidth = heard ? 1.8 : 1.2; pen.setLineDash(heard ? [] : [4, 4]);
+      const ax = px(a.x), bx = px(b.x), ay = py(a.side) - 9, by = py(b.side) - 9;
+      const lift = Math.min(ay, by) - Math.min(34, 8 + Math.abs(ax - bx) / 9);
+      pen.beginPath(); pen.moveTo(ax, ay); pen.quadraticCurveTo((ax + bx) / 2, lift, bx, by); pen.stroke(); pen.setLineDash([]);
+      if (!back) {
+        const angle = Math.atan2(by - lift, bx - (ax + bx) / 2);
+        pen.beginPath(); pen.moveTo(bx, by); pen.lineTo(bx - 8 * Math.cos(angle - 0.4), by - 8 * Math.sin(angle - 0.4)); pen.lineTo(bx - 8 * Math.cos(angle + 0.4), by - 8 * Math.sin(angle + 0.4)); pen.fill();
+      }
+    }
+
+    // trains: bar to scale (at least 8 px), head as a dot, number above and speed below
+    here.forEach((p, k) => {
+      if (!p) return;
+      const train = film.trains[k], x = px(p.x), y = py(p.side), length = Math.max(8, (train.length / span) * room);
+      if (x < left - 20 || x - length > width) return;
+      pen.fillStyle = shown(train.color); pen.strokeStyle = css("--panel"); pen.lineWidth = 1.5;
+      pen.beginPath(); pen.roundRect(x - length, y - 6, length, 12, 3); pen.fill(); pen.stroke();
+      pen.beginPath(); pen.arc(x, y, 7, 0, 7); pen.fill(); pen.stroke();
+      if (count <= 30 || +at("zoom").value > 2) {
+        pen.fillStyle = ink; pen.font = "bold 13px system-ui, DejaVu Sans, sans-serif"; pen.textAlign = "left"; pen.fillText(train.name, x + 10, y - 9);
+        pen.font = "11px system-ui, DejaVu Sans, sans-serif"; pen.fillStyle = soft; pen.textAlign = "center"; pen.fillText(p.v.toFixed(1) + " m/s", x, y + 16);
+      }
+    });
+    pen.restore();
+    pen.fillStyle = soft; pen.textAlign = "left"; pen.font = "12px system-ui, DejaVu Sans, sans-serif";
+    film.tracks.forEach((name, k) => pen.fillText("track " + name, 8, py(k)));
+    pen.fillStyle = ink; pen.font = "bold 13px system-ui, DejaVu Sans, sans-serif"; pen.fillText("t = " + +now.toFixed(3) + " s", 8, 16);
+    pen.fillStyle = soft; pen.textAlign = "right"; pen.font = "12px system-ui, DejaVu Sans, sans-serif"; pen.fillText("running to the right →", width - 10, 16);
+  }
+
+  function tell() { // the same in words
+    const words = [], edges = [], silent = [];
+    for (let k = 0; k < count; k++) {
+      const p = place(k, 0);
+      if (p) words.push(`${film.trains[k].name}: ${Number.isInteger(p.side) ? "track " + film.tracks[p.side] : "crossover to track " + film.tracks[p.side > nearest(k) ? Math.ceil(p.side) : Math.floor(p.side)]}, ${(p.x / 1000).toFixed(3)} km, ${p.v.toFixed(2)} m/s`);
+    }
+    for (let c = 0; c < couples; c++) {
+      const state = links[frame * couples + c], [a, b] = film.pairs[c];
+      if (!state) continue;
+      const name = film.trains[a].name + "→" + film.trains[b].name;
+      (state === 2 ? edges : silent).push(name);
+    }
+    const few = (list) => list.length > 40 ? list.slice(0, 40).join(" · ") + ` and ${list.length - 40} more` : list.join(" · ");
+    const happened = film.events.filter((e) => Math.abs(e.time - times[frame]) < 1e-6).map((e) => e.kind + (e.text ? " (" + e.text + ")" : ""));
+    at("now").replaceChildren(...[["now-links", "Heard: " + (few(edges) || "nobody") + (silent.length ? "; lost: " + few(silent) : "")], ["now-trains", few(words)], ["now-events", happened.length ? "Now: " + happened.slice(0, 6).join("; ") : ""]].flatMap(([id, text]) => {
+      const span = document.createElement("span"); span.id = id; span.textContent = text; return [span, document.createElement("br")];
+    }));
+  }
+  function nearest(k) { // the track train k came from
+    for (let f = frame; f >= 0; f--) { const s = lateral[f * count + k]; if (Number.isInteger(s)) return s; }
+    return 0;
+  }
+
+  function show(wanted) {
+    frame = Math.max(0, Math.min(times.length - 1, wanted)); now = times[frame];
+    slider.value = frame; slider.setAttribute("aria-valuetext", +now.toFixed(3) + " s"); at("clock").textContent = +now.toFixed(3) + " s";
+    paint(0); tell(); cursors();
+  }
+  function frame_of(time) { // the last one not after ``time``
+    let low = 0, high = times.length - 1;
+    while (low < high) { const middle = (low + high + 1) >> 1; if (times[middle] <= time + 1e-6) low = middle; else high = middle - 1; }
+    return low;
+  }
+  function go_to_time(time) { pause(); show(frame_of(time)); }
+  function tick(stamp) {
+    if (!playing) return;
+    now += Math.min(stamp - last, 100) / 1000 * +at("rate").value; last = stamp;
+    if (now >= whole[1]) { pause(); show(times.length - 1); return; }
+    const before = frame; frame = frame_of(now);
+    const gap = times[Math.min(frame + 1, times.length - 1)] - times[frame];
+    paint(gap > 0 ? Math.max(0, (now - times[frame]) / gap) : 0);
+    slider.value = frame; at("clock").textContent = now.toFixed(1) + " s";
+    if (frame !== before) { tell(); cursors(); }
+    requestAnimationFrame(tick);
+  }
+  function pause() { playing = false; at("play").textContent = "Play"; at("play").setAttribute("aria-pressed", "false"); }
+  function play() {
+    if (frame === times.length - 1) show(0);
+    playing = true; at("play").textContent = "Pause"; at("play").setAttribute("aria-pressed", "true"); last = performance.now(); requestAnimationFrame(tick);
+  }
+  const toggle = () => { if (playing) { pause(); show(frame); } else play(); };
+  const moments = [...new Set(film.events.map((e) => e.time))].sort((a, b) => a - b);
+  const next_event = (sign) => { const ahead = moments.filter((t) => sign * (t - times[frame]) > 1e-6); if (ahead.length) go_to_time(sign > 0 ? ahead[0] : ahead[ahead.length - 1]); };
+
+  slider.addEventListener("input", () => { pause(); show(+slider.value); });
+  at("play").addEventListener("click", toggle);
+  at("before").addEventListener("click", () => next_event(-1));
+  at("after").addEventListener("click", () => next_event(1));
+  at("follow").addEventListener("change", () => paint(0));
+  at("zoom").addEventListener("input", () => paint(0));
+  document.querySelectorAll("button.link").forEach((b) => b.addEventListener("click", () => { go_to_time(+b.dataset.time); at("tracks").scrollIntoView(); }));
+  document.addEventListener("keydown", (event) => {
+    if (["INPUT", "SELECT", "BUTTON", "TEXTAREA"].includes(event.target.tagName) && !(event.target === slider && event.shiftKey)) return;
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const done = { " ": toggle, ArrowLeft: () => event.shiftKey ? next_event(-1) : (pause(), show(frame - 1)), ArrowRight: () => event.shiftKey ? next_event(1) : (pause(), show(frame + 1)), Home: () => (pause(), show(0)), End: () => (pause(), show(times.length - 1)) }[event.key];
+    if (done) { event.preventDefault(); done(); }
+  });
+
+  // ---- light and dark, address, start ------------------------------------------------------------------------------------------
+  function recolour() { paint(0); return redraw().then(cursors); }
+  at("theme").addEventListener("click", () => { document.documentElement.dataset.theme = isDark() ? "light" : "dark"; recolour(); });
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolour);
+  addEventListener("resize", () => { paint(0); setTimeout(cursors, 300); });
+  const from_address = () => { const wanted = /^#t=([\d.]+)$/.exec(location.hash); if (wanted) go_to_time(+wanted[1]); };
+  addEventListener("hashchange", from_address);
+  show(0);
+  from_address();
+  draw_next();
+})();
