@@ -42,7 +42,7 @@ def find_log(folder: Path, name: str) -> Path | None:
 
 def kind_of(path: Path) -> str:
     """``xml``, ``csv`` or ``parquet``, from the content."""
-    with _opened(path) as stream:
+    with opened(path) as stream:
         head = stream.read(512)
     if head[:4] == b"PAR1":
         return "parquet"
@@ -51,7 +51,7 @@ def kind_of(path: Path) -> str:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[BinaryIO]:
+def opened(path: Path) -> Iterator[BinaryIO]:
     """The file, unpacked if it is gzipped; what goes wrong while it is read becomes one line."""
     try:
         with open(path, "rb") as raw:
@@ -98,7 +98,7 @@ def elements(path: Path, root: str, wanted: set[str]) -> Iterator[tuple[str, dic
     parser.StartElementHandler, parser.EndElementHandler = start, end
     parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
     fed = 0
-    with _opened(path) as stream:
+    with opened(path) as stream:
         while chunk := stream.read(CHUNK):
             fed += len(chunk)
             _feed(parser, path, chunk, False)
@@ -189,12 +189,12 @@ def _floats(path: Path, texts: list[str], name: str) -> Floats:
 
 
 def _fcd_csv(path: Path) -> Iterator[pd.DataFrame]:
-    with _opened(path) as stream:
+    with opened(path) as stream:
         head = stream.readline(1 << 16)
     separator = next((s for s in ";,\t" if s.encode() in head), ";")
     known = {name.strip().strip('"') for name in head.decode("utf-8", "replace").strip().split(separator)}
     names = _columns(path, known)
-    with _opened(path) as stream:
+    with opened(path) as stream:
         try:
             reader = pd.read_csv(
                 stream, sep=separator, usecols=list(names.values()), chunksize=BATCH_ROWS, dtype=dict.fromkeys(TEXTS.values(), str),
