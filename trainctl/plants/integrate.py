@@ -19,7 +19,7 @@ from numba import njit
 from numba.core import cgutils as untyped_cgutils
 from numba.extending import intrinsic, overload
 
-from trainctl.signals import POWERS, Floats, Ints, Links, Reference, leader_at
+from trainctl.signals import FORCE, POWERS, Floats, Ints, Links, Reference, leader_at
 
 types: Any = numba.types
 typeof: Any = numba.typeof
@@ -158,7 +158,8 @@ def see(parts, loop, first, length, links, own, work, extremes):  # type: ignore
     for i in range(len(first) - 1):
         a, b = first[i], first[i + 1]
         for u in range(a, b):
-            widen(extremes.force_min, extremes.force_max, u, work.applied[u])
+            force = own[u, FORCE] if own.shape[1] > FORCE else work.applied[u]  # what the actuator gives, where it has dynamics
+            widen(extremes.force_min, extremes.force_max, u, force)
             if u + 1 < b:
                 widen(extremes.coupler_min, extremes.coupler_max, u, own[u, 0] - own[u + 1, 0] - length[u])
         watch(i, loop.law, work.leader, first, own, links, extremes.watched[i])
