@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from trainctl import cli_diff, cli_extend, cli_report, cli_resume
 from trainctl.errors import InputError, TrainctlError
 
 if TYPE_CHECKING:
@@ -87,6 +88,11 @@ def run(
     name: ScenarioName = DEFAULT_SCENARIO,
     out: Annotated[Path | None, typer.Option(help="Run folder; default runs/NAME. A run of ours there is replaced.")] = None,
     backend: Annotated[Literal["sumo", "numeric"], typer.Option(help="SUMO, or the same loop without a simulator.")] = "sumo",
+    gui: Annotated[bool, typer.Option("--gui", help="Watch the run in sumo-gui: tracks, trains by role, links.")] = False,
+    gui_program: Annotated[str, typer.Option(help="The program --gui starts; sumo is the same without a window.")] = "sumo-gui",
+    checkpoint_every: Annotated[
+        float | None, typer.Option(help="Scenario time between two checkpoints [s]; `trainctl resume` goes on from the last one.")
+    ] = None,
     settings: Settings = None,
     force: Annotated[bool, typer.Option("--force", help="Replace whatever lies at the run folder.")] = False,
     strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if any bound was broken.")] = False,
@@ -100,7 +106,7 @@ def run(
     folder = out if out is not None else Path("runs") / Path(name).stem
     shown = not (quiet or as_json)
     with _progress(f"{Path(name).stem}", shown and sys.stderr.isatty()) as advance:
-        done = runner.run(prepared, folder, backend, force, sys.argv, advance)
+        done = runner.run(prepared, folder, backend, force, sys.argv, advance, gui_program if gui else None, checkpoint_every)
     if as_json:
         _print_json({"folder": str(folder), **done.info, "metrics": done.metrics})
     elif shown:
@@ -356,6 +362,12 @@ def _options(
     ] = False,
 ) -> None:
     """Closed-loop testbed for cooperative train control on SUMO rail networks."""
+
+
+cli_diff.register(app)
+cli_extend.register(app)
+cli_report.register(app)
+cli_resume.register(app)
 
 
 def _tell(lines: Iterable[str]) -> None:

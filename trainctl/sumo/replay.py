@@ -1,0 +1,165 @@
+"""A finished run shown again: SUMO moves the trains as they were recorded, nothing is computed anew."""
+
+from __future__ import annotations
+
+import tempfile
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+import sumo_net
+from sumo_net import Line, LineError
+from trainctl.errors import InputError, SimulatorError
+from trainctl.record.run import Run
+from trainctl.scenario import Scenario, examine
+from trainctl.signals import Bools, Floats, Ints, Links
+from trainctl.sumo.gui import Gui
+from trainctl.world import Start
+
+
+def replay(run: Run, binary: str = "sumo-gui", from_s: float = 0.0, delay_ms: float = 20.0) -> int:
+    """Show a run in sumo-gui.
+
+    Parameters
+    ----------
+    run : Run
+        A run folder; one that broke off is shown as far as it was recorded.
+    binary : str
+        "sumo-gui", or "sumo" for the same without a window.
+    from_s : float
+        Where to begin [s].
+    delay_ms : float
+        Least time of a step on the screen.
+
+    Returns
+    -------
+    int
+        Number of steps shown.
+
+    Raises
+    ------
+    InputError
+        Nothing to show.
+    SimulatorError
+        SUMO could not be started, or the window was closed.
+    """
+    scenario, _ = examine(run.scenario)
+    if scenario is None:
+        raise InputError(f"{run.folder}: its scenario.toml is damaged")
+    ids = list(scenario.ids)
+    trains = run.trains
+    trains = trains[trains["time_s"] >= from_s - 1e-9]
+    times, edge_names = np.unique(trains["time_s"].to_numpy()), _grid(trains, "edge", ids)
+    if len(times) < 2:
+        raise InputError(f"{run.folder}: fewer than two instants recorded from {from_s:g} s on")
+    step = round(float(times[1] - times[0]), 9)
+    times = times[: 1 + int(np.sum(np.cumprod(np.abs(np.diff(times) - step) < 1e-6)))]  # the last row may come early
+    position, speed = _grid(trains, "position_m", ids).astype(float), _grid(trains, "speed_mps", ids).astype(float)
+    with tempfile.TemporaryDirectory(prefix="replay.") as scratch:
+        line, net = _network(run, scenario, Path(scratch))
+        edge = np.array([[line.index[name] for name in row] for row in edge_names[: len(times)]])
+        gui = Gui(line, net, Path(scratch), step, len(times), binary, delay_ms)
+        try:
+            gui.start(_start(scenario, line, edge, position[0], speed[0]))
+            links = dict(_links(run, ids, line, float(times[0])))
+            for k, (now, then) in enumerate(pairwise(times.tolist())):
+                if (now_links := links.get(round(now, 6))) is not None:
+                    gui.linked(*now_links)
+                gui.move(position[k + 1] - position[k], then - now)
+        finally:
+            gui.close()
+    return len(times) - 1
+
+
+def _grid(trains: pd.DataFrame, column: str, ids: list[str]) -> np.ndarray:
+    """A column as rows of instants, columns of trains."""
+    return trains.pivot(index="time_s", columns="train", values=column)[ids].to_numpy()
+
+
+def _network(run: Run, scenario: Scenario, folder: Path) -> tuple[Line, Path]:
+    """The net that SUMO ran on, or for a run without SUMO the one of its line."""
+    try:
+        kept = sorted((run.folder / "sumo").glob("*.net.xml"))
+        if kept:
+            net = folder / kept[0].name
+            net.write_bytes(kept[0].read_bytes())
+            return Line.read(net), net
+        known, name = sumo_net.shipped(), str(scenario.network.line)
+        if name not in known:
+            raise InputError(f"{run.folder}: made without SUMO on {name}, which is not a shipped line: run it with SUMO to see it")
+        spec = sumo_net.read_spec(known[name])
+        return Line.of(spec), sumo_net.build(spec, folder)
+    except LineError as error:
+        raise SimulatorError("; ".join(error.mistakes)) from None
+
+
+def _start(scenario: Scenario, line: Line, edge: Ints, position: Floats, speed: Floats) -> Start:
+    """The trains at the first instant, on routes made of the edges they were seen on and the rest of their last track."""
+    routes = []
+    for i in range(edge.shape[1]):
+        seen = [int(edge[0, i])] + [int(b) for a, b in pairwise(edge[:, i]) if a != b]
+        way: list[int] = [seen[0]]
+        for k in seen[1:]:
+            way += _between(line, way[-1], k)
+        end = float(line.start_m[way[-1]] + line.length_m[way[-1]])
+        rest = line.route(line.tracks[way[-1]], round(end, 6)) if end < line.end_m - 1e-6 else ()
+        routes.append((*(line.edges[k] for k in way), *rest))
+    consists = scenario.consists()
+    return Start(
+        ids=scenario.ids, edge=edge[0], lane_position=position - line.start_m[edge[0]], speed=speed,
+        length=consists.train_length(), unit_length=[consists.length[a:b] for a, b in pairwise(consists.first)], routes=routes,
+    )  # fmt: skip
+
+
+def _between(line: Line, here: int, there: int) -> list[int]:
+    """Edges after ``here`` up to ``there``: a long recording interval leaves some out."""
+    way = []
+    while here != there:
+        end, track = round(float(line.start_m[here] + line.length_m[here]), 6), line.tracks[here]
+        if abs(float(line.start_m[there]) - end) < 1e-6:
+            here = there
+        elif line.tracks[there] == track or end < float(line.start_m[there]):
+            here = line.locate(track, end)[0]
+        else:
+            raise SimulatorError(f"recorded edges {line.edges[here]} and {line.edges[there]} do not follow each other")
+        way.append(here)
+    return way
+
+
+def _links(run: Run, ids: list[str], line: Line, begin: float) -> list[tuple[float, tuple[Links, Ints]]]:
+    """Each change of who hears whom from ``begin`` on: (time, (links, formation))."""
+    table = run.links
+    table = table[table["time_s"] >= begin - 1e-9] if len(table) else table
+    changes: list[tuple[float, tuple[Links, Ints]]] = []
+    before: object = None
+    tracks = run.trains
+    at = dict(iter(tracks.groupby("time_s", sort=True)))
+    pairs = dict(iter(table.groupby("time_s", sort=True))) if len(table) else {}
+    for time, rows in at.items():
+        if time < begin - 1e-9:
+            continue
+        rows = rows.set_index("train").loc[ids]
+        heard = pairs.get(time)
+        edges = () if heard is None else tuple(
+            (ids.index(r), ids.index(s), bool(h))
+            for s, r, h in zip(heard["sender"].astype(str), heard["receiver"].astype(str), heard["heard"], strict=True)
+        )  # fmt: skip
+        track = np.array([line.track_ids.index(t) for t in rows["track"].astype(str)], np.int64)
+        now = (edges, tuple(track.tolist()))
+        if now != before:
+            before = now
+            changes.append((round(float(time), 6), (_as_links(sorted(edges), rows["position_m"].to_numpy(float), track), track)))
+    return changes
+
+
+def _as_links(edges: list[tuple[int, int, bool]], position: Floats, track: Ints) -> Links:
+    """What the picture needs of the links."""
+    receiver, sender = (np.array([e[k] for e in edges], np.int64) for k in (0, 1))
+    heard: Bools = np.array([e[2] for e in edges], bool)
+    none = np.zeros(len(edges))
+    return Links(
+        sender, receiver, np.searchsorted(receiver, np.arange(len(track) + 1)).astype(np.int64), none, none, none, none, heard,
+        np.zeros(len(track)), np.lexsort((-position, track)),
+    )  # fmt: skip
