@@ -37,7 +37,9 @@ def new_controller(
 def export(
     folder: RunFolder,
     form: Annotated[Literal["csv", "mat"], typer.Option("--format", help="csv: a file per table; mat: one file for MATLAB.")],
-    out: Annotated[Path | None, typer.Option(help="csv: folder, default RUN/export; mat: file, default RUN/export/RUN.mat.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="csv: folder, default RUN/export; mat: file, default RUN/export/RUN.mat.")
+    ] = None,
 ) -> None:
     """Write the tables of a run for other programs; units are in the names of the columns."""
     from trainctl.record.export import to_csv, to_mat

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -60,13 +60,13 @@ def replay(run: Run, binary: str = "sumo-gui", from_s: float = 0.0, delay_ms: fl
     with tempfile.TemporaryDirectory(prefix="replay.") as scratch:
         line, net = _network(run, scenario, Path(scratch))
         edge = np.array([[line.index[name] for name in row] for row in edge_names[: len(times)]])
+        links = _changes(run, times, ids, _tracks(line)[edge], position)
         gui = Gui(line, net, Path(scratch), step, len(times), binary, delay_ms)
         try:
             gui.start(_start(scenario, line, edge, position[0], speed[0]))
-            links = dict(_links(run, ids, line, float(times[0])))
             for k, (now, then) in enumerate(pairwise(times.tolist())):
-                if (now_links := links.get(round(now, 6))) is not None:
-                    gui.linked(*now_links)
+                if now in links:
+                    gui.linked(*links[now])
                 gui.move(position[k + 1] - position[k], then - now)
         finally:
             gui.close()
@@ -113,6 +113,11 @@ def _start(scenario: Scenario, line: Line, edge: Ints, position: Floats, speed: 
     )  # fmt: skip
 
 
+def _tracks(line: Line) -> Ints:
+    """Track of every edge, as index into ``line.track_ids``."""
+    return np.array([line.track_ids.index(t) for t in line.tracks], np.int64)
+
+
 def _between(line: Line, here: int, there: int) -> list[int]:
     """Edges after ``here`` up to ``there``: a long recording interval leaves some out."""
     way = []
@@ -128,33 +133,26 @@ def _between(line: Line, here: int, there: int) -> list[int]:
     return way
 
 
-def _links(run: Run, ids: list[str], line: Line, begin: float) -> list[tuple[float, tuple[Links, Ints]]]:
-    """Each change of who hears whom from ``begin`` on: (time, (links, formation))."""
-    table = run.links
-    table = table[table["time_s"] >= begin - 1e-9] if len(table) else table
-    changes: list[tuple[float, tuple[Links, Ints]]] = []
+def _changes(run: Run, times: Floats, ids: list[str], track: Ints, position: Floats) -> dict[float, tuple[Links, Ints]]:
+    """Who hears whom, and the track of each train, at the instants where that changed."""
+    table = run.links[["time_s", "sender", "receiver", "heard"]] if len(run.links) else pd.DataFrame()
+    rows = zip(*(table[c].tolist() for c in table.columns), strict=True)
+    number = {name: i for i, name in enumerate(ids)}
+    edges = {
+        time: tuple(sorted((number[r], number[s], bool(h)) for _, s, r, h in group))
+        for time, group in groupby(rows, key=lambda row: row[0])
+    }
+    found: dict[float, tuple[Links, Ints]] = {}
     before: object = None
-    tracks = run.trains
-    at = dict(iter(tracks.groupby("time_s", sort=True)))
-    pairs = dict(iter(table.groupby("time_s", sort=True))) if len(table) else {}
-    for time, rows in at.items():
-        if time < begin - 1e-9:
-            continue
-        rows = rows.set_index("train").loc[ids]
-        heard = pairs.get(time)
-        edges = () if heard is None else tuple(
-            (ids.index(r), ids.index(s), bool(h))
-            for s, r, h in zip(heard["sender"].astype(str), heard["receiver"].astype(str), heard["heard"], strict=True)
-        )  # fmt: skip
-        track = np.array([line.track_ids.index(t) for t in rows["track"].astype(str)], np.int64)
-        now = (edges, tuple(track.tolist()))
+    for k, time in enumerate(times.tolist()):
+        now = (edges.get(time, ()), tuple(track[k].tolist()))
         if now != before:
             before = now
-            changes.append((round(float(time), 6), (_as_links(sorted(edges), rows["position_m"].to_numpy(float), track), track)))
-    return changes
+            found[time] = (_as_links(now[0], position[k], track[k]), track[k])
+    return found
 
 
-def _as_links(edges: list[tuple[int, int, bool]], position: Floats, track: Ints) -> Links:
+def _as_links(edges: tuple[tuple[int, int, bool], ...], position: Floats, track: Ints) -> Links:
     """What the picture needs of the links."""
     receiver, sender = (np.array([e[k] for e in edges], np.int64) for k in (0, 1))
     heard: Bools = np.array([e[2] for e in edges], bool)
