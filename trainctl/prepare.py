@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import importlib.util
 import json
 import math
 import pkgutil
+import sys
+import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -108,15 +111,68 @@ def _module(package: Any, name: str) -> Any:
     return importlib.import_module(f"{package.__name__}.{name}")
 
 
-def find_law(name: str) -> Any:
-    """The module of a law: one of ours, or an entry point of another package."""
+def find_law(name: str, folder: Path = Path()) -> Any:
+    """The module of a law: one of ours, an entry point of another package, or a file.
+
+    Parameters
+    ----------
+    name : str
+        Name, or the path of a file ending in .py.
+    folder : Path
+        Where a relative path starts; if there is no such file, it starts in the current directory.
+
+    Raises
+    ------
+    InputError
+        No such law, it cannot be imported, or it lacks something a law must have.
+    """
+    if name.endswith(".py"):
+        file = folder / name if (folder / name).is_file() else Path(name)
+        if not file.is_file():
+            raise InputError(f"controller.law = {name}: no such file")
+        return _complete(name, partial(_law_file, file))
     if name.isidentifier() and any(m.name == name for m in pkgutil.iter_modules(controllers.__path__)):
         module = _module(controllers, name)
         if hasattr(module, "CLOCK"):
             return module
     for entry in importlib.metadata.entry_points(group=ENTRY_POINTS, name=name):
-        return entry.load()
+        return _complete(name, entry.load)
     raise InputError(f"controller.law = {name}: no such law; known: {', '.join(laws())}")
+
+
+def _law_file(file: Path) -> Any:
+    """A law's file as a module, read anew each time."""
+    name = f"trainctl_law_{file.stem}"
+    spec = importlib.util.spec_from_file_location(name, file.resolve())
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # pydantic looks annotations up there
+    spec.loader.exec_module(module)
+    return module
+
+
+#: What a module must have to be a law, by its clock.
+PARTS = {
+    "sampled": ("Params", "violations", "constants", "message", "demand"),
+    "continuous": ("ORDER", "MESSAGE", "WATCHED", "Params", "violations", "constants", "message", "demand", "watch"),
+}
+
+
+def _complete(name: str, load: Any) -> Any:
+    """Somebody else's law, if it can be imported and has all its parts."""
+    try:
+        module = load()
+    except Exception as error:  # whatever somebody else's module raises
+        lines = traceback.extract_tb(error.__traceback__)
+        where = f" (line {error.lineno})" if isinstance(error, SyntaxError) else f" ({lines[-1].name}, line {lines[-1].lineno})"
+        raise InputError(f"controller.law = {name}: cannot be imported: {type(error).__name__}: {error}{where}") from None
+    clock = getattr(module, "CLOCK", None)
+    if clock not in PARTS:
+        raise InputError(f'controller.law = {name}: CLOCK = {clock!r}: must be "sampled" or "continuous"')
+    missing = [part for part in PARTS[clock] if not hasattr(module, part)]
+    if missing:
+        raise InputError(f"controller.law = {name}: a {clock} law needs {', '.join(missing)}")
+    return module
 
 
 def find_observer(name: str) -> Any:
@@ -172,7 +228,7 @@ def prepare(scenario: Scenario, file: str, folder: Path, known: Sequence[str] = 
             found.extend(f"network: {m}" for m in error.mistakes)
         return None
 
-    law = attempt(find_law, scenario.controller.law)
+    law = attempt(find_law, scenario.controller.law, folder)
     params = attempt(_params, law.Params, scenario.controller.keys(), "controller") if law else None
     observer = attempt(find_observer, scenario.observer.kind)
     observer_params = attempt(_params, observer.Params, scenario.observer.keys(), "observer") if observer else None
@@ -236,11 +292,12 @@ def _network(scenario: Scenario, folder: Path) -> tuple[Line, Any, Path | None]:
 
 def _plan(scenario: Scenario) -> graph.Plan:
     """The topology's rule as arrays; what is missing is told."""
-    top, ids = scenario.topology, list(scenario.ids)
+    top, ids = scenario.topology, scenario.ids
+    index = {name: i for i, name in enumerate(ids)}
     said: dict[tuple[int, int], graph.Stated] = {}
     found = []
     for k, link in enumerate(scenario.link, 1):
-        a, b = (ids.index(i) for i in link.ends)
+        a, b = (index[i] for i in link.ends)
         if (a, b) in said:
             found.append(f"link[{k}]: trains {', '.join(link.ends)} have a link already")
         said[a, b] = graph.Stated(link.desired_m, link.lower_m, link.upper_m, link.weight)
@@ -265,7 +322,7 @@ def _plan(scenario: Scenario) -> graph.Plan:
     if found:
         raise InputError(found)
     table = np.array(rows, float).reshape(len(rows), 3)
-    pairs = [(tuple(ids.index(i) for i in link.ends), link) for link in scenario.link]
+    pairs = [(tuple(index[i] for i in link.ends), link) for link in scenario.link]
     both = [(a, b) for (a, b), link in pairs] + [(b, a) for (a, b), link in pairs if link.between]
     return graph.Plan(
         rule=top.rule, equal=top.desired == "equal", first_slot=top.first_slot_m,

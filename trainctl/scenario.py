@@ -12,6 +12,8 @@ import importlib.resources
 import json
 import math
 import tomllib
+from collections import Counter
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -307,12 +309,12 @@ class Scenario(Table):
     @classmethod
     def _unique(cls, trains: tuple[Train, ...]) -> tuple[Train, ...]:
         ids = [t.id for t in trains]
-        twice = sorted({i for i in ids if ids.count(i) > 1})
+        twice = sorted(i for i, count in Counter(ids).items() if count > 1)
         if twice:
             raise ValueError(f"id {', '.join(twice)} stands more than once")
         return trains
 
-    @property
+    @cached_property
     def ids(self) -> tuple[str, ...]:
         """Train ids in formation order."""
         return tuple(t.id for t in self.train)
@@ -320,7 +322,7 @@ class Scenario(Table):
     def cross_references(self) -> list[str]:
         """Mistakes between tables of this file: names that do not exist, lists of the wrong length."""
         found = []
-        ids, types = self.ids, self.train_type
+        ids, types = dict.fromkeys(self.ids), self.train_type
         for t in self.train:
             if t.type not in types:
                 found.append(f"train[{t.id}].type = {t.type}: no [train_type.{t.type}]; there are: {', '.join(types)}")
@@ -518,7 +520,11 @@ def examine(data: dict[str, Any]) -> tuple[Scenario | None, list[str]]:
             scenario = Scenario.model_validate_json(json.dumps(rest, default=str))
         except ValidationError as error:
             found += [line for line in mistakes(error, rest) if not (rest is not data and line.endswith(": missing"))]
-            rest = _without(rest, [e["loc"] for e in error.errors() if e["type"] != "missing"])
+            places = [e["loc"] for e in error.errors() if e["type"] != "missing"]
+            if any(len(p) == 2 and p[0] in ("train", "link") for p in places):
+                break  # without one of its trains or links it is another scenario
+            # Lists keep their numbers, or go as a whole.
+            rest = _without(rest, [p[:1] if len(p) == 2 and isinstance(p[1], int) else p for p in places])
             if isinstance(rest.get("run"), dict):
                 rest["run"].setdefault("duration_s", rest["run"].get("step_s", 1.0))  # nothing else is checked against it
         else:
