@@ -38,11 +38,9 @@ class Exchange:
         """Carry what old links brought over to the new edge list; a new link has brought nothing yet."""
         heard, ever = np.zeros((len(now.sender), self.heard.shape[1])), np.zeros(len(now.sender), bool)
         if before is not None:
-            rows = {(int(s), int(r)): k for k, (s, r) in enumerate(zip(before.sender, before.receiver, strict=True))}
-            for k, (s, r) in enumerate(zip(now.sender, now.receiver, strict=True)):
-                old = rows.get((int(s), int(r)))
-                if old is not None:
-                    heard[k], ever[k] = self.heard[old], self.ever[old]
+            old, new = (k.sender * len(k.slot) + k.receiver for k in (before, now))
+            _, was, row = np.intersect1d(old, new, assume_unique=True, return_indices=True)
+            heard[row], ever[row] = self.heard[was], self.ever[was]
         self.heard, self.ever = heard, ever
 
     def deliver(self, sent: Floats, position: Floats, links: Links, count: int) -> Bools:

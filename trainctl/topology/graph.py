@@ -7,7 +7,6 @@ Spacings are front to front.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -49,29 +48,23 @@ class Plan(NamedTuple):
         return self.first_slot - np.concatenate([[0.0], np.cumsum(self.desired)])
 
 
-class Gap(NamedTuple):
-    """Desired spacing and bounds of one directed link [m]."""
+def gaps(plan: Plan, sender: Ints, receiver: Ints, ahead: Bools) -> Floats:
+    """Desired spacing x_sender - x_receiver, its bounds and the weight of directed links, shape (4, L).
 
-    desired: float
-    lower: float
-    upper: float
-    weight: float
-
-
-def gap(plan: Plan, sender: int, receiver: int, ahead: bool) -> Gap:
-    """Desired spacing x_sender - x_receiver and its bounds.
-
-    What the scenario states, else the sums over the consecutive links between their slots: where a train left, the new link spans
-    its hole. ``ahead`` says whether the sender runs ahead, for formations without slots.
+    The sums over the consecutive links between their slots: where a train left, the new link spans its hole. ``ahead`` (L,) says
+    whether the sender runs ahead, for formations without slots. What the scenario states comes on top, see ``links``.
     """
-    a, b = min(sender, receiver), max(sender, receiver)
-    span = slice(0, 1) if plan.equal else slice(a, b)
-    desired, lower, upper = (float(s[span].sum()) for s in (plan.desired, plan.lower, plan.upper))
-    if not (ahead if plan.equal else sender < receiver):
-        desired, lower, upper = -desired, -upper, -lower
-    said = plan.stated.get((sender, receiver), Stated(None, None, None, None))
-    keep = (desired, lower, upper, plan.weight)
-    return Gap(*(old if new is None else new for new, old in zip(said, keep, strict=True)))
+    if plan.equal:
+        begin, end = np.zeros_like(sender), np.ones_like(sender)
+    else:
+        begin, end, ahead = np.minimum(sender, receiver), np.maximum(sender, receiver), sender < receiver
+    bounds = np.column_stack([begin, end]).ravel()
+    desired, lower, upper = (
+        np.add.reduceat(np.append(s, 0.0), bounds)[::2] if len(bounds) else np.zeros(0)
+        for s in (plan.desired, plan.lower, plan.upper)
+    )
+    rows = np.where(ahead, [desired, lower, upper], [-desired, -upper, -lower])
+    return np.vstack([rows, np.full(len(sender), plan.weight)])
 
 
 def order_on_tracks(position: Floats, track: Ints) -> Ints:
@@ -86,36 +79,44 @@ def in_order(order: Ints, position: Floats, track: Ints) -> bool:
     return bool(np.all(t[1:] >= t[:-1]) and not np.any(same & (p[1:] > p[:-1])))
 
 
-def pairs(plan: Plan, order: Ints, track: Ints) -> list[tuple[int, int]]:
-    """Undirected edges (ahead, behind) of rule "same_track", front to rear."""
-    near = [(int(a), int(b)) for a, b in pairwise(order) if track[a] == track[b]]
-    known = set(near)
+def pairs(plan: Plan, order: Ints, track: Ints) -> Ints:
+    """Undirected edges (ahead, behind) of rule "same_track", shape (2, k): neighbours front to rear, then what is extra."""
+    beside = track[order[:-1]] == track[order[1:]]
+    near = np.stack([order[:-1][beside], order[1:][beside]])
+    if not plan.extra:
+        return near
+    known = set(zip(*near.tolist(), strict=True))
     more = [(a, b) for a, b in plan.extra if track[a] == track[b] and (a, b) not in known]
-    return near + more
+    return np.hstack([near, np.array(more, np.int64).reshape(-1, 2).T])
 
 
 def links(plan: Plan, order: Ints, track: Ints) -> Links:
     """The directed edge list for trains on ``track`` (n,) in ``order`` (n,), from ``order_on_tracks``."""
-    if plan.rule == "links":
-        directed = list(plan.fixed)
-    else:
-        directed = [d for a, b in pairs(plan, order, track) for d in ((a, b), (b, a))]
     n = len(track)
+    if plan.rule == "links":
+        sender, receiver = np.array(plan.fixed, np.int64).reshape(-1, 2).T
+    else:
+        edge = pairs(plan, order, track)
+        sender, receiver = np.hstack([edge, edge[::-1]])
+    by_receiver = np.lexsort((sender, receiver))
+    sender, receiver = sender[by_receiver].copy(), receiver[by_receiver].copy()
     rank = np.empty(n, np.int64)
     rank[order] = np.arange(n)
-    rows = [(receiver, sender, *gap(plan, sender, receiver, bool(rank[sender] < rank[receiver]))) for sender, receiver in directed]
-    rows.sort(key=lambda r: (r[0], r[1]))
-    table = np.array(rows, float).reshape(len(rows), 6)
-    receiver = table[:, 0].astype(np.int64)
+    table = gaps(plan, sender, receiver, rank[sender] < rank[receiver])
+    if plan.stated:
+        key = receiver * n + sender
+        for (s, r), said in plan.stated.items():
+            for k in np.flatnonzero(key == r * n + s).tolist():
+                table[:, k] = [old if new is None else new for new, old in zip(said, table[:, k], strict=True)]
     return Links(
-        sender=table[:, 1].astype(np.int64),
+        sender=sender,
         receiver=receiver,
         first=np.searchsorted(receiver, np.arange(n + 1)).astype(np.int64),
-        desired=table[:, 2].copy(),
-        lower=table[:, 3].copy(),
-        upper=table[:, 4].copy(),
-        weight=table[:, 5].copy(),
-        heard=np.ones(len(rows), bool),
+        desired=table[0].copy(),
+        lower=table[1].copy(),
+        upper=table[2].copy(),
+        weight=table[3].copy(),
+        heard=np.ones(len(sender), bool),
         slot=plan.slot,
         order=np.asarray(order, np.int64).copy(),
     )
