@@ -45,6 +45,10 @@ class Simulation:
         Track every train is on, as index into ``line.track_ids``.
     formation : ndarray, shape (n,)
         Track of the formation every train belongs to; a train whose join is delayed stands outside of all (-1 - its index).
+    relinked : tuple or None
+        Time, ``own`` and links at the last change of topology: what the constants were made of.
+    between : callable or None
+        Called after every step.
     """
 
     def __init__(self, prepared: Prepared, world: World, journal: Journal) -> None:
@@ -66,7 +70,9 @@ class Simulation:
         self.exchange = Exchange(loss=top.loss, delay=round(top.delay_s / period), radius=top.range_m or np.inf, seed=run.seed or 0)
         self.motion: Points | Units = Points(prepared) if prepared.scenario.plant.kind == "point" else Units(prepared)
         self.demand = Demand(np.zeros(n), np.zeros(n, bool))
-        self.alarms = monitor.Alarms()
+        self.alarms = monitor.Alarms(prepared)
+        self.relinked: tuple[float, Floats, Links] | None = None
+        self.between: Callable[[], Any] | None = None
         self._start()
 
     @property
@@ -89,6 +95,8 @@ class Simulation:
         self._record(t, seen, before, motion, past, disturbed)
         self.world.move(motion.displacement, self.p.scenario.run.step_s)
         self.k += 1
+        if self.between is not None:
+            self.between()
 
     def run(self, progress: Callable[[int, int], Any] | None = None) -> None:
         """All steps; ``progress(done, steps)`` is called about a hundred times."""
@@ -207,6 +215,7 @@ class Simulation:
             if same:
                 return
         p = self.p
+        self.relinked = t, self.own.copy(), links
         scene = p.scene(self.own, links, t)
         self.constants = p.law.constants(p.params, scene)
         self.exchange.relink(before, links)
@@ -225,6 +234,8 @@ class Simulation:
             formations=[[p.scenario.ids[i] for i in sorted(group)] for group in groups],
             start_condition=[] if before is None else p.law.violations(p.params, scene),
         )
+        for alarm in self.alarms.relinked(t, groups, self.formation, scene):
+            self.journal.event(t, "violation", **alarm)
 
     def _control(self, t: float, disturbed: disturbance.Disturbed) -> Demand:
         """Exchange messages and evaluate the sampled law."""
@@ -260,7 +271,8 @@ class Simulation:
 
     def _check(self, t: float, motion: Motion) -> None:
         """Numbers must stay finite; a train never moves backwards; bounds that break are told once."""
-        wrong = np.flatnonzero(~np.isfinite(motion.displacement))
+        finite = np.logical_and.reduceat(np.isfinite(self.own).all(axis=1), self.p.heads)
+        wrong = np.flatnonzero(~(finite & np.isfinite(motion.displacement)))
         if len(wrong):
             names = ", ".join(self.p.scenario.ids[i] for i in wrong)
             raise LawError(f"the state of train {names} is no longer finite after {t:g} s: the law or the step diverged")
@@ -286,7 +298,7 @@ class Simulation:
             time=t, seen=seen, track=self.track, own=own, speed=heads[:, SPEED], ahead=self.ahead, links=self.links,
             motion=motion, saturated=self._saturated(motion), extremes=past, disturbed=disturbed,
         )  # fmt: skip
-        for alarm in self.alarms.new(self.p, row):
+        for alarm in self.alarms.new(row):
             self.journal.event(t, "violation", **alarm)
         if self._recorded:
             self.journal.write(row)

@@ -2,22 +2,44 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import os
+import shutil
+import signal
 import sys
+import threading
 import time
+import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
+import tomli_w
+
 import sumo_net
 from sumo_net import LineError
+from trainctl import checkpoint
 from trainctl.errors import InputError, SimulatorError
 from trainctl.loop import Simulation
-from trainctl.prepare import Prepared
-from trainctl.record.folder import about_run, claim, finish, remove, write_info, write_json
+from trainctl.prepare import Prepared, prepare
+from trainctl.record.folder import (
+    about_run,
+    claim,
+    finish,
+    held,
+    ours,
+    partial_of,
+    plain,
+    remove,
+    write_info,
+    write_json,
+)  # fmt: skip
 from trainctl.record.journal import Journal
 from trainctl.record.metrics import metrics
 from trainctl.record.run import Run
+from trainctl.scenario import examine
 from trainctl.world import Numeric, World
 
 Backend = Literal["sumo", "numeric"]
@@ -31,6 +53,7 @@ def run(
     command_line: Sequence[str] = (),
     progress: Callable[[int, int], Any] | None = None,
     gui: str | None = None,
+    checkpoint_every_s: float | None = None,
 ) -> Run:
     """Run a scenario into the folder ``out``.
 
@@ -50,6 +73,8 @@ def run(
         Called with (steps done, steps).
     gui : str, optional
         Program that shows the run, see ``open_world``.
+    checkpoint_every_s : float, optional
+        Scenario time between two checkpoints [s], from which ``resume`` goes on; default none.
 
     Returns
     -------
@@ -63,7 +88,7 @@ def run(
     TrainctlError
         The run failed; ``out.partial`` keeps what was recorded, and run.json says why and when.
     """
-    with opened(p, out, backend, force, command_line, gui) as simulation:
+    with opened(p, out, backend, force, command_line, gui, checkpoint_every_s) as simulation:
         simulation.run(progress)
     return Run(out)
 
@@ -76,47 +101,233 @@ def opened(
     force: bool = False,
     command_line: Sequence[str] = (),
     gui: str | None = None,
+    checkpoint_every_s: float | None = None,
 ) -> Iterator[Simulation]:
     """A run folder and the loop in it, for whoever drives it; arguments and errors as in ``run``.
 
     When the block ends the run is complete; when it raises, the run failed.
     """
+    every = checkpoint_every_s
+    step = p.scenario.run.step_s
+    if every is not None and not (every >= step and abs(every / step - round(every / step)) < 1e-6):
+        raise InputError(f"--checkpoint-every {every:g}: must be a multiple of step_s = {step:g}")
+    if every is not None and gui is not None:
+        raise InputError("--checkpoint-every: a run that is watched cannot be resumed; leave out --gui")
     partial = claim(out, force)
-    text = p.scenario.toml()
-    (partial / "scenario.toml").write_text(text, encoding="utf-8")
-    info = about_run(text, p.scenario.run.seed or 0, command_line or sys.argv, backend=backend)
-    write_info(partial, info)
-    began, journal, world, simulation = time.perf_counter(), None, None, None
+    with held(partial):
+        text = p.scenario.toml()
+        info = about_run(text, p.scenario.run.seed or 0, command_line or sys.argv, backend=backend)
+        write_info(partial, info)
+        (partial / "scenario.toml").write_text(text, encoding="utf-8")
+        begin(partial, p, checkpoint_every_s)
+        with _driven(p, partial, info, gui, checkpoint_every_s, None) as simulation:
+            yield simulation
+        finish(out)
 
-    def ended(status: str, **more: Any) -> None:
-        steps = simulation.k if simulation is not None else 0
-        write_info(
-            partial, {**info, "status": status, "steps": steps, "wall_time_s": round(time.perf_counter() - began, 3), **more}
-        )
+
+def resume(folder: Path, progress: Callable[[int, int], Any] | None = None) -> tuple[Run, float | None]:
+    """Go on with a run that was killed, interrupted or failed, from its last checkpoint.
+
+    Parameters
+    ----------
+    folder : Path
+        ``DIR`` or ``DIR.partial``.
+    progress : callable, optional
+        Called with (steps done, steps).
+
+    Returns
+    -------
+    tuple of Run and float or None
+        The finished run folder; the scenario time [s] from which it went on, None if all steps were done already.
+
+    Raises
+    ------
+    InputError
+        There is nothing to resume, or it was made by other versions.
+    TrainctlError
+        As ``run``.
+    """
+    folder = Path(os.path.abspath(folder))
+    out = folder.with_name(folder.name.removesuffix(".partial")) if folder.name.endswith(".partial") else folder
+    partial = partial_of(out)
+    with held(partial):
+        if not ours(partial):
+            if ours(out) and Run(out).info["status"] == "complete":
+                return Run(out), None
+            raise InputError(f"{partial}: no run that could be resumed; begin one with `trainctl run`")
+        info = {k: v for k, v in Run(partial).info.items() if k not in ("failure", "steps", "wall_time_s")}
+        if info["status"] == "complete":
+            remove(partial / checkpoint.FOLDER)
+            finish(out)
+            return Run(out), None
+        info = {**info, "status": "running"}
+        p, every = again(partial)
+        done = partial / checkpoint.FOLDER / checkpoint.DONE
+        if done.exists():
+            _complete(p, partial, info, json.loads(done.read_text(encoding="utf-8")))
+            finish(out)
+            return Run(out), None
+        saved = checkpoint.read(partial / checkpoint.FOLDER, p)
+        if saved is None:
+            for name in ("segments", "events.jsonl", "metrics.json", *(path.name for path in partial.glob("*.parquet"))):
+                remove(partial / name)
+        remove(partial / "sumo")
+        write_info(partial, info)
+        with _driven(p, partial, info, None, every, saved) as simulation:
+            since = simulation.time
+            simulation.run(progress)
+        finish(out)
+    return Run(out), since
+
+
+@contextmanager
+def _driven(
+    p: Prepared, partial: Path, info: dict[str, Any], gui: str | None, every_s: float | None, saved: checkpoint.Saved | None
+) -> Iterator[Simulation]:
+    """The loop in its folder, from the beginning or from a checkpoint, and what is left to do when it has ended."""
+    place = partial / checkpoint.FOLDER
+    # not zeros: some file systems keep no room for those
+    (place / checkpoint.RESERVE).write_bytes(os.urandom(checkpoint.RESERVE_BYTES))
+    began = time.perf_counter() - (saved.values["wall_time_s"] if saved else 0.0)
+    journal, world, simulation, tape = None, None, None, None
+
+    def elapsed() -> float:
+        return round(time.perf_counter() - began, 3)
 
     try:
-        journal = Journal(partial, p)
-        world = open_world(p, partial, backend, gui)
-        simulation = Simulation(p, world, journal)
-        yield simulation
-        world.close()
-        for at, message in world.messages():
-            journal.event(simulation.time if at is None else at, "sumo_warning", message=message)
-        journal.close()
-        write_json(partial / "metrics.json", metrics(Run(partial)))
-        ended("complete", violations=simulation.alarms.total)
+        with _stops() as stop:
+            journal = Journal(partial, p, saved.values["recorder"] if saved else None)
+            world = open_world(p, partial, info["backend"], gui)
+            if every_s is not None:
+                world = tape = checkpoint.Tape(world, place, saved)
+            simulation = Simulation(p, world, journal)
+            if saved is not None and tape is not None:
+                checkpoint.restore(simulation, tape, saved)
+            simulation.between = _Between(simulation, journal, tape, place, every_s, stop, elapsed)
+            stop.waits = True
+            yield simulation
+            stop.waits = False
+            world.close()
+            for at, message in world.messages():
+                journal.event(simulation.time if at is None else at, "sumo_warning", message=message)
+            end = {"steps": simulation.k, "violations": simulation.alarms.total, "first_violation": simulation.alarms.first}
+            done = {"end": end, "wall_time_s": elapsed(), "recorder": journal.recorder.cut()}
+            checkpoint.replace(place / checkpoint.DONE, json.dumps(plain(done)).encode())
+            journal.close()
+            _complete(p, partial, info, {**done, "wall_time_s": elapsed()}, journal)
     except BaseException as error:
-        for thing in (world, journal):
-            if thing is not None:
-                _quietly(thing.close)
+        if world is not None:
+            _quietly(world.close)
+        if journal is not None:
+            _quietly(journal.leave if tape is not None else journal.close)
         if isinstance(error, InputError):
             remove(partial)
         else:
-            when = simulation.time if simulation is not None else 0.0
+            remove(place / checkpoint.RESERVE)
+            failure = {"reason": str(error) or type(error).__name__, "time_s": simulation.time if simulation is not None else 0.0}
             status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-            _quietly(ended, status, failure={"reason": str(error) or type(error).__name__, "time_s": when})
+            steps = simulation.k if simulation is not None else 0
+            _quietly(
+                write_info, partial, {**info, "status": status, "steps": steps, "wall_time_s": elapsed(), "failure": failure}
+            )
         raise
-    finish(out)
+
+
+def _complete(p: Prepared, partial: Path, info: dict[str, Any], done: dict[str, Any], journal: Journal | None = None) -> None:
+    """Join the tables, measure, and say that the run is complete; may be done again after a kill."""
+    if journal is None:
+        Journal(partial, p, done["recorder"]).close()
+    write_json(partial / "metrics.json", metrics(Run(partial)))
+    write_info(partial, {**info, **done["end"], "status": "complete", "wall_time_s": done["wall_time_s"]})
+    remove(partial / checkpoint.FOLDER)
+
+
+class _Between:
+    """What happens between two steps: a checkpoint if one is due, an end if one was asked for."""
+
+    def __init__(
+        self, simulation: Simulation, journal: Journal, tape: checkpoint.Tape | None, place: Path, every_s: float | None,
+        stop: _Stop, elapsed: Callable[[], float],
+    ) -> None:  # fmt: skip
+        self.simulation, self.journal, self.tape, self.place, self.stop, self.elapsed = (
+            simulation, journal, tape, place, stop, elapsed,
+        )  # fmt: skip
+        self.every = round(every_s / simulation.p.scenario.run.step_s) if every_s is not None else 0
+
+    def __call__(self) -> None:
+        asked = self.stop.asked
+        if self.tape is not None and (asked is not None or self.simulation.k % self.every == 0):
+            more = {"recorder": self.journal.recorder.cut(), "tape": self.tape.save(), "wall_time_s": self.elapsed()}
+            checkpoint.write(self.place, self.simulation, more)
+        if asked is not None:
+            raise KeyboardInterrupt(f"interrupted by {asked}")
+
+
+class _Stop:
+    """Ctrl-C, SIGTERM and SIGHUP: while ``waits``, the first one lets the step end; otherwise they interrupt at once."""
+
+    def __init__(self) -> None:
+        self.waits, self.asked = False, None  # type: bool, str | None
+
+    def __call__(self, number: int, frame: object) -> None:
+        name = signal.Signals(number).name
+        if not self.waits or self.asked is not None:
+            raise KeyboardInterrupt(f"interrupted by {name}")
+        self.asked = name
+
+
+@contextmanager
+def _stops() -> Iterator[_Stop]:
+    """Catch the signals that ask to stop, if this is the thread that gets them."""
+    stop, before = _Stop(), {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) not in (signal.SIG_IGN, None):
+                before[number] = signal.signal(number, stop)
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def begin(partial: Path, p: Prepared, every_s: float | None) -> None:
+    """Put down what ``again`` needs, with the network as it was read."""
+    place = partial / checkpoint.FOLDER
+    place.mkdir()
+    start: dict[str, Any] = {"file": p.file, "checkpoint_every_s": every_s}
+    if p.net is not None:
+        start["net"] = p.net.name
+        shutil.copyfile(p.net, place / p.net.name)
+    else:
+        start["line"] = p.spec.model_dump(mode="json", by_alias=True, exclude_none=True)
+    checkpoint.replace(place / checkpoint.START, json.dumps(start).encode())
+
+
+def again(partial: Path) -> tuple[Prepared, float | None]:
+    """The scenario of a run folder, ready to run, and its ``checkpoint_every_s``."""
+    place = partial / checkpoint.FOLDER
+    try:
+        start = json.loads((place / checkpoint.START).read_text(encoding="utf-8"))
+        text = (partial / "scenario.toml").read_text(encoding="utf-8")
+        data = tomllib.loads(text)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{partial}: it was killed before it began: begin it again with `trainctl run` ({error})") from None
+    network, file = data["network"], str(place / "network.toml")
+    if "net" in start:
+        data["network"] = {"net": str(place / start["net"])}
+    elif network["line"].endswith(".toml"):
+        Path(file).write_text(tomli_w.dumps(start["line"]), encoding="utf-8")
+        data["network"] = {"line": file}
+    scenario, found = examine(data)
+    if scenario is None:
+        raise InputError([f"{partial / 'scenario.toml'}: {line}" for line in found])
+    p = prepare(scenario, start["file"], place, found)
+    original = p.scenario.model_copy(update={"network": type(p.scenario.network)(**network)})
+    p = dataclasses.replace(p, scenario=original)
+    if p.scenario.toml() != text:
+        raise InputError(f"{partial / 'scenario.toml'}: changed since the run began, or read by another version; run it again")
+    return p, start["checkpoint_every_s"]
 
 
 def open_world(p: Prepared, folder: Path, backend: Backend, gui: str | None = None) -> World:

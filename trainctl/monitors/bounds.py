@@ -1,13 +1,19 @@
-"""Bounds watched while a run goes on: the first time each is broken becomes an event; the metrics count them afterwards."""
+"""What must hold is watched while a run goes on: the first time anything breaks becomes an event; the metrics count afterwards.
+
+Watched: speed and input bounds, link spacings, the constrained quantities of continuous laws, couplers, trains inside one another,
+connected formations, and the balance of energies. That SUMO moved every train just as far as it was told is watched by the world
+itself, and ends the run.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from trainctl.monitors.energy import Balance
 from trainctl.signals import Floats, Ints
 
 if TYPE_CHECKING:
@@ -17,46 +23,102 @@ if TYPE_CHECKING:
 #: Rounding of positions on a line of some hundred kilometres, as SUMO hands them back.
 ROUNDING = 1e-6
 
+Alarm = dict[str, Any]
 
-@dataclass
+
 class Alarms:
-    """Which bounds have been broken so far, and how often (steps)."""
+    """Which bounds have been broken so far, and how often (steps).
 
-    count: dict[tuple[str, str], int] = field(default_factory=dict)
-    neighbours: Ints = field(default_factory=lambda: np.zeros((2, 0), np.int64))  # (ahead, behind) on one track, a step ago
+    Attributes
+    ----------
+    count : dict
+        (bound, who) -> number of steps or rows in which it was broken.
+    first : dict or None
+        The first violation: time [s], bound, who, value, limit.
+    """
+
+    def __init__(self, p: Prepared) -> None:
+        n = len(p.scenario.train)
+        self.p = p
+        self.count: dict[tuple[str, str], int] = {}
+        self.first: Alarm | None = None
+        self.neighbours: Ints = np.zeros((2, 0), np.int64)  # (ahead, behind) on one track, a step ago
+        self.length = p.consists.train_length()
+        units = p.scenario.plant.kind != "point"
+        self.watched: tuple[str, ...] = tuple(getattr(p.law, "WATCHED", ())) if units and not p.sampled else ()
+        # (lower and upper, n, q): of the interval the extremes are of, and of the present links
+        free = np.stack([np.full((n, len(self.watched)), -np.inf), np.full((n, len(self.watched)), np.inf)])
+        self.during, self.now = free, free.copy()
+        self.energy = Balance(p) if units else None
 
     @property
     def total(self) -> int:
         """Number of bounds broken at least once."""
         return len(self.count)
 
-    def new(self, p: Prepared, row: Row) -> Iterator[dict[str, Any]]:
+    def new(self, row: Row) -> Iterator[Alarm]:
         """Bounds broken in this row for the first time, as fields of an event."""
-        ids, links = p.scenario.ids, row.links
-        speed, bounds = row.speed, p.bounds
-        yield from self._per_train("speed_lower_mps", speed, bounds.speed_lower, speed < bounds.speed_lower - ROUNDING, ids)
-        yield from self._per_train("speed_upper_mps", speed, bounds.speed_upper, speed > bounds.speed_upper + ROUNDING, ids)
+        for alarm in self._all(row):
+            if self.first is None:
+                self.first = {"time_s": row.time, **alarm}
+            yield alarm
+
+    def relinked(self, time: float, groups: Sequence[Sequence[int]], formation: Ints, scene: Any) -> Iterator[Alarm]:
+        """Take over the law's bounds on new links; a formation that is in pieces is told.
+
+        Parameters
+        ----------
+        time : float
+            Now [s].
+        groups : sequence of sequence of int
+            Trains that are connected by links, directly or not.
+        formation : ndarray, shape (n,)
+            The formation every train belongs to.
+        scene : Scene
+            For the law's ``watched_bounds``.
+        """
+        bounds = getattr(self.p.law, "watched_bounds", None)
+        if self.watched and bounds is not None:
+            self.now = np.stack(bounds(self.p.params, scene))
+        piece = np.empty(len(formation), np.int64)
+        for k, group in enumerate(groups):
+            piece[list(group)] = k
+        whole = np.zeros_like(formation) if self.p.plan.rule == "links" else formation
+        pairs = np.unique(np.stack([whole, piece]), axis=1)[0]
+        for key in np.unique(pairs[1:][pairs[1:] == pairs[:-1]]).tolist():
+            who = ",".join(self.p.scenario.ids[i] for i in np.flatnonzero(whole == key))
+            for alarm in self._once("connected_pieces", who, float((pairs == key).sum()), 1.0):
+                if self.first is None:
+                    self.first = {"time_s": time, **alarm}
+                yield alarm
+
+    def _all(self, row: Row) -> Iterator[Alarm]:
+        ids, bounds, speed = self.p.scenario.ids, self.p.bounds, row.speed
+        yield from self._per_train("speed_lower_mps", speed, bounds.speed_lower, speed < bounds.speed_lower - ROUNDING)
+        yield from self._per_train("speed_upper_mps", speed, bounds.speed_upper, speed > bounds.speed_upper + ROUNDING)
         if row.motion is not None:
             u = row.motion.input
-            yield from self._per_train("input_lower_mps2", u, bounds.input_lower, u < bounds.input_lower - ROUNDING, ids)
-            yield from self._per_train("input_upper_mps2", u, bounds.input_upper, u > bounds.input_upper + ROUNDING, ids)
-        yield from self._couplers(p, row)
-        yield from self._collisions(p, row)
+            yield from self._per_train("input_lower_mps2", u, bounds.input_lower, u < bounds.input_lower - ROUNDING)
+            yield from self._per_train("input_upper_mps2", u, bounds.input_upper, u > bounds.input_upper + ROUNDING)
+        yield from self._couplers(row)
+        yield from self._constrained(row)
+        yield from self._energies(row)
+        yield from self._collisions(row)
+        links = row.links
         spacing = row.seen.position[links.sender] - row.seen.position[links.receiver]
         ahead = spacing > 0.0  # each pair once
-        names = [f"{ids[s]}-{ids[r]}" for s, r in zip(links.sender, links.receiver, strict=True)] if len(spacing) < 64 else None
         for key, bound, broken in (
             ("spacing_lower_m", links.lower, spacing < links.lower - ROUNDING),
             ("spacing_upper_m", links.upper, spacing > links.upper + ROUNDING),
         ):
-            hit = np.flatnonzero(broken & ahead)
-            for k in hit.tolist():
-                who = names[k] if names else f"{ids[links.sender[k]]}-{ids[links.receiver[k]]}"
-                yield from self._once(key, who, float(spacing[k]), float(bound[k]))
+            for k in np.flatnonzero(broken & ahead).tolist():
+                yield from self._once(
+                    key, f"{ids[links.sender[k]]}-{ids[links.receiver[k]]}", float(spacing[k]), float(bound[k])
+                )
 
-    def _couplers(self, p: Prepared, row: Row) -> Iterator[dict[str, Any]]:
+    def _couplers(self, row: Row) -> Iterator[Alarm]:
         """Couplers beyond their range in any sub-step since the last row."""
-        x, bounds = row.extremes, p.scenario.bounds
+        p, x, bounds = self.p, row.extremes, self.p.scenario.bounds
         if x is None or bounds.coupler_lower_m is None or bounds.coupler_upper_m is None:
             return
         for key, value, bound, broken in (
@@ -67,23 +129,66 @@ class Alarms:
                 i = int(np.searchsorted(p.consists.first, u, side="right")) - 1
                 yield from self._once(key, f"{p.scenario.ids[i]}.{u - p.consists.first[i] + 1}", float(value[u]), bound)
 
-    def _collisions(self, p: Prepared, row: Row) -> Iterator[dict[str, Any]]:
+    def _constrained(self, row: Row) -> Iterator[Alarm]:
+        """The law's own constrained quantities in any sub-step since the last row, against the bounds that held then."""
+        x = row.extremes
+        if not self.watched:
+            return
+        if x is None:  # not recorded: extremes go on, perhaps under new links, so the wider bounds serve
+            lower, upper = np.minimum(self.during[0], self.now[0]), np.maximum(self.during[1], self.now[1])
+            self.during = np.stack([lower, upper])
+            return
+        low, high = self.during
+        self.during = self.now
+        seen = x.watched_min <= x.watched_max
+        for side, value, bound, broken in (
+            ("lower", x.watched_min, low, seen & (x.watched_min < low - ROUNDING)),
+            ("upper", x.watched_max, high, seen & (x.watched_max > high + ROUNDING)),
+        ):
+            for i, q in np.argwhere(broken).tolist():
+                stem, _, unit = self.watched[q].rpartition("_")
+                yield from self._once(f"{stem}_{side}_{unit}", self.p.scenario.ids[i], float(value[i, q]), float(bound[i, q]))
+
+    def _energies(self, row: Row) -> Iterator[Alarm]:
+        """Trains whose energy changes by something else than what is accounted for."""
+        if self.energy is None:
+            return
+        for i, share in self.energy.broken(row):
+            yield from self._once("energy_balance_share", self.p.scenario.ids[i], share, self.energy.LIMIT)
+
+    def _collisions(self, row: Row) -> Iterator[Alarm]:
         """Trains inside one another, whatever the law: in the order of the step before, so that passing through is seen too."""
-        order = np.lexsort((-row.seen.position, row.track))
+        ids, order = self.p.scenario.ids, np.lexsort((-row.seen.position, row.track))
         beside = row.track[order[:-1]] == row.track[order[1:]]
         now = np.stack([order[:-1][beside], order[1:][beside]])
         for a, b in (self.neighbours, now):
-            gap = row.seen.position[a] - p.consists.train_length()[a] - row.seen.position[b]
+            gap = row.seen.position[a] - self.length[a] - row.seen.position[b]
             for k in np.flatnonzero((row.track[a] == row.track[b]) & (gap < -ROUNDING)).tolist():
-                yield from self._once("gap_m", f"{p.scenario.ids[a[k]]}-{p.scenario.ids[b[k]]}", float(gap[k]), 0.0)
+                yield from self._once("gap_m", f"{ids[a[k]]}-{ids[b[k]]}", float(gap[k]), 0.0)
         self.neighbours = now
 
-    def _per_train(self, key: str, value: Floats, bound: Floats, broken: Any, ids: Any) -> Iterator[dict[str, Any]]:
+    def _per_train(self, key: str, value: Floats, bound: Floats, broken: Any) -> Iterator[Alarm]:
         for i in np.flatnonzero(broken).tolist():
-            yield from self._once(key, ids[i], float(value[i]), float(bound[i]))
+            yield from self._once(key, self.p.scenario.ids[i], float(value[i]), float(bound[i]))
 
-    def _once(self, key: str, who: str, value: float, bound: float) -> Iterator[dict[str, Any]]:
+    def _once(self, key: str, who: str, value: float, bound: float) -> Iterator[Alarm]:
         seen = self.count.get((key, who), 0)
         self.count[key, who] = seen + 1
         if not seen:
             yield {"bound": key, "who": who, "value": value, "limit": bound}
+
+    def values(self) -> dict[str, Any]:
+        """What it remembers, as plain JSON; the rest is in ``arrays``."""
+        return {"count": [[*key, number] for key, number in self.count.items()], "first": self.first}
+
+    def arrays(self) -> tuple[NDArray[Any], ...]:
+        """Arrays it remembers."""
+        return (self.neighbours, self.during, self.now, *(self.energy.arrays() if self.energy else ()))
+
+    def restore(self, values: dict[str, Any], arrays: Sequence[NDArray[Any]]) -> None:
+        """Remember what ``values`` and ``arrays`` told."""
+        self.count = {(key, who): number for key, who, number in values["count"]}
+        self.first = values["first"]
+        self.neighbours, self.during, self.now = (a.copy() for a in arrays[:3])
+        if self.energy is not None:
+            self.energy.restore(arrays[3:])

@@ -6,11 +6,13 @@ then. A run that failed stays at ``DIR.partial`` with what it had recorded.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -38,8 +40,28 @@ def ours(folder: Path) -> bool:
 
 
 def free(folder: Path) -> bool:
-    """True if nothing is lost by writing there: it does not exist, or is an empty directory."""
-    return not os.path.lexists(folder) or (folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir()))
+    """True if nothing is lost by writing there: it does not exist, or is an empty directory, or a run killed at its first word."""
+    if not os.path.lexists(folder):
+        return True
+    return folder.is_dir() and not folder.is_symlink() and all(path.name == f"{INFO}.new" for path in folder.iterdir())
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Keep other processes from writing a run folder; the hold ends with the process, however that ends."""
+    try:
+        at = os.open(folder, os.O_RDONLY)
+    except FileNotFoundError:
+        yield
+        return
+    try:
+        try:
+            fcntl.flock(at, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"{folder}: another process is writing this run") from None
+        yield
+    finally:
+        os.close(at)
 
 
 def claim(folder: Path | str, force: bool = False) -> Path:
@@ -65,7 +87,8 @@ def claim(folder: Path | str, force: bool = False) -> Path:
         if not (free(place) or ours(place) or force):
             raise InputError(f"{place}: exists and is not a run of trainctl: choose another --out, or --force to replace it")
     try:
-        remove(partial)
+        with held(partial):
+            remove(partial)
         partial.mkdir(parents=True)
     except OSError as error:
         raise InputError(f"{partial}: cannot be written: {error.strerror}") from error
@@ -84,8 +107,11 @@ def finish(folder: Path | str) -> None:
 
 
 def remove(place: Path) -> None:
-    """Remove a file, a link or a directory with all in it; nothing there is fine."""
+    """Remove a file, a link or a directory with all in it; nothing there is fine. Of a run, run.json goes last: it says whose."""
     if place.is_dir() and not place.is_symlink():
+        for path in place.iterdir() if (place / INFO).is_file() else ():
+            if path.name != INFO:
+                remove(path)
         shutil.rmtree(place)
     elif os.path.lexists(place):
         place.unlink()

@@ -11,6 +11,7 @@ from trainctl.record.recorder import ENERGIES, UNIT_EXTRAS, Recorder, standard_t
 from trainctl.signals import POSITION, SPEED, Bools, Floats, Ints, Links
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from trainctl.motion import Motion
@@ -48,7 +49,7 @@ DISTURBANCES = (
 class Journal:
     """The tables of one run, filled row by row."""
 
-    def __init__(self, folder: Path, p: Prepared) -> None:
+    def __init__(self, folder: Path, p: Prepared, resume: Mapping[str, Any] | None = None) -> None:
         self.p = p
         self.has_units = p.scenario.plant.kind != "point"
         watched = tuple(getattr(p.law, "WATCHED", ())) if self.has_units and not p.sampled else ()
@@ -59,7 +60,7 @@ class Journal:
             p.scenario.ids, p.line.track_ids, p.line.edges, units=self.has_units, watched=watched,
             train_extras=(*(ENERGIES if self.has_units else ()), *self.disturbances), unit_extras=self.extras,
         )  # fmt: skip
-        self.recorder = Recorder(folder, tables, {"scenario_sha256": p.scenario.hash()})
+        self.recorder = Recorder(folder, tables, {"scenario_sha256": p.scenario.hash()}, resume=resume)
         self.saved = time.monotonic()
         self.train_of_unit = np.repeat(np.arange(len(p.scenario.train)), np.diff(p.consists.first))
         self.unit = np.arange(len(self.train_of_unit)) - p.consists.first[:-1][self.train_of_unit] + 1
@@ -123,6 +124,10 @@ class Journal:
     def close(self) -> None:
         """Complete the files."""
         self.recorder.close()
+
+    def leave(self) -> None:
+        """End, with what was written in closed segments, from which the run can be resumed."""
+        self.recorder.leave()
 
 
 def _finite(values: Floats) -> Floats:

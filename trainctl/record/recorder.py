@@ -156,8 +156,19 @@ class Recorder:
         os.fsync(self._events.fileno())
         return {"segments": {name: t.count for name, t in self._tables.items()}, "events_bytes": self._events.tell()}
 
+    def leave(self) -> None:
+        """End without joining the segments: all rows until now are readable, and ``cut`` of before can be resumed."""
+        if self._events.closed:
+            return
+        self._events.close()
+        for table in self._tables.values():
+            table.cut()
+
     def close(self) -> None:
-        """Write ``<table>.parquet`` from the segments and remove them. If the disk is full the segments stay readable."""
+        """Write ``<table>.parquet`` from the segments and remove them. If the disk is full the segments stay readable.
+
+        May be done again after a kill: what is joined already stays.
+        """
         if self._events.closed:
             return
         self._events.close()
@@ -230,6 +241,8 @@ class _Segments:
 
     def join(self, target: Path) -> None:
         """One file of full row groups out of all segments, the same bytes wherever they were cut."""
+        if target.exists():  # before a kill
+            return
         if self.count == 1:  # its groups are full already
             os.replace(self.path(0), target)
             return
