@@ -113,6 +113,62 @@ CASES = {
 }  # fmt: skip
 
 
+EMU, ROBUST, FAULTY = (f'extends = "{name}"\n' for name in ("emu_finite_time", "robust_constrained", "fault_tolerant"))
+FAULT = '[[fault]]\ntrain = 1\nunit = 2\nkind = "constant"\namplitude_n_per_s = 2e5\n'
+CASES |= {
+    "unit data missing": (
+        'extends = "three_tracks"\n[train_type.other]\nunits = 2\nunit_length_m = 80.0\n', ["train_type.other.unit_mass_kg: missing"],
+    ),
+    "coupler outside its range": (
+        EMU + "[[train]]\nid = 1\ncoupler_m = [0.0, 0.12, 0.0]\n", ["train 1: coupler 2 = 0.12 m: must start inside (-0.1, 0.1) m"],
+    ),
+    "couplers of the wrong number": (
+        EMU + "[[train]]\nid = 1\ncoupler_m = [0.0, 0.12]\n", ["train[1].coupler_m: has 2 values, the type has 3 couplers"],
+    ),
+    "p1 below k/m": (EMU + "[controller]\np_1 = 2.0\n", ["controller.p_1 = 2: must exceed coupler stiffness over mass, 2 1/s2"]),
+    "step too large for the law": (EMU + "[run]\nsub_step_s = 0.05\n", ["run.sub_step_s = 0.05: at most 0.0101 s"]),
+    "interval too short": (
+        EMU + "[[train]]\nid = 2\nposition_m = 107500.0\n", ["trains 1 and 2: interval = 980.0 m: must start above emergency_distance_m"],
+    ),
+    "negative weight": (ROBUST + "[topology]\nweight = -0.01\n", ["link[2 > 1].weight = -0.01: must be above 0"]),
+    "not strongly connected": (
+        ROBUST + '[topology]\nrule = "links"\n[[link]]\nsender = 1\nreceiver = 2\n[[link]]\nsender = 2\nreceiver = 3\n'
+        "[[link]]\nsender = 3\nreceiver = 4\n",
+        ["the graph must be strongly connected", "what train 4 sends does not reach train 1, train 2, train 3"],
+    ),
+    "h T not below 1": (ROBUST + "[controller]\nh_per_s = 1.5\n", ["controller.h_per_s = 1.5: h T = 1.2 with T = 0.8 s"]),
+    "v0 above the maximum": (ROBUST + "[reference]\nspeed_mps = 90.0\n", ["reference.speed_mps = 90: must be below the maximum speed 85"]),
+    "amplitude without unit": (
+        ROBUST + '[[disturbance]]\non = "position"\nshape = "constant"\namplitude = 0.1\n', ["the key must carry the unit: amplitude_m"],
+    ),
+    "noise without seed": (
+        ROBUST + '[[disturbance]]\non = "position"\nshape = "gaussian"\nstd_m = 0.1\n', ["random, so it needs a seed, [run] seed"],
+    ),
+    "clamps beside the bounds": (
+        ROBUST + "[bounds]\nspeed_upper_mps = 84.0\n", ["plant.speed_upper_mps = 85.0: must be [bounds] speed_upper_mps = 84.0"],
+    ),
+    "outside (39)": (
+        FAULTY + "[[train]]\nid = 3\nposition_m = 4000.0\n", ["distance error -4948 m is not between -2351 and 1947 m", "condition (39)"],
+    ),
+    "gains outside (38)": (
+        FAULTY + "[controller]\nhead_l2 = 2.0\nhead_l3 = 4.0\nhead_l4 = 0.4\n",
+        ["head_l2 = 2: must be above 2", "head_l3 = 4: must be above", "head_l4 = 0.4: must be above 1/2"],
+    ),
+    "unobservable fault model": (FAULTY + "[observer]\nfault_constant_n_per_s = 0.0\n", ["the constant fault is unobservable"]),
+    "window ends before it starts": (
+        FAULTY + FAULT + "start_s = 400\nend_s = 300\n", ["end_s = 300: the window ends before it starts, start_s = 400"],
+    ),
+    "windows overlap": (
+        FAULTY + FAULT + "start_s = 400\nend_s = 800\n" + FAULT + "start_s = 700\nend_s = 900\n",
+        ["fault[2].start_s = 700: this constant of train 1 unit 2 overlaps fault[1], 400 to 800 s"],
+    ),
+    "step too large for an active limit": (
+        'extends = "fault_tolerant_force_limit"\n[run]\nsub_step_s = 0.1\n', ["run.sub_step_s = 0.1: too large where a force limit acts"],
+    ),
+    "wrong plant": (FAULTY + '[plant]\nkind = "coupled_units"\n', ["plant.kind = coupled_units: law fault_tolerant runs on actuated_units"]),
+}  # fmt: skip
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_each_mistake_is_told_in_words(case, typed, tmp_path):
     text, expected = CASES[case]
