@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from trainctl.record.run import Run
 
 __all__ = ["EXACT", "Report", "Tolerance", "Tolerances", "diff", "parse_tolerances", "read_tolerances"]
 
-#: A golden run holds only some instants; its run.json says so.
+#: Entry of run.json: the logs of a golden run that hold only some instants.
 THINNED = "thinned"
 
 
@@ -141,7 +141,7 @@ def diff(a: Path | str, b: Path | str, tolerances: Tolerances | None = None) -> 
     elif (a / INFO).exists() and (b / INFO).exists():
         _runs(report, Run(a), Run(b), chosen, names)
     else:
-        _folders(report, a, b, chosen, names, False)
+        _folders(report, a, b, chosen, names)
         if not report.tables and not report.files:
             raise InputError(f"{a}, {b}: neither run folders nor folders with logs of SUMO")
     report.renamed = {old: new for new, old in names.items()}
@@ -179,12 +179,14 @@ def _note(report: Report, text: str) -> None:
         report.notes.append(text)
 
 
-def _folders(report: Report, a: Path, b: Path, tolerances: Tolerances, names: dict[str, str], thinned: bool) -> None:
+def _folders(
+    report: Report, a: Path, b: Path, tolerances: Tolerances, names: dict[str, str], thinned: Collection[str] = ()
+) -> None:
     """Compare all logs of SUMO's in two folders."""
     in_a, in_b = sumo_logs_in(a), sumo_logs_in(b)
     for kind in (k.name for k in KINDS):
         if kind in in_a and kind in in_b:
-            _logs(report, in_a[kind], in_b[kind], tolerances, names, thinned, kind)
+            _logs(report, in_a[kind], in_b[kind], tolerances, names, kind in thinned, kind)
         elif kind in in_a:
             report.files.append(f"{kind}: only in A")
         elif kind in in_b and not thinned:
@@ -193,7 +195,7 @@ def _folders(report: Report, a: Path, b: Path, tolerances: Tolerances, names: di
 
 def _runs(report: Report, a: Run, b: Run, tolerances: Tolerances, names: dict[str, str]) -> None:
     """Compare two run folders."""
-    thinned = bool(a.info.get(THINNED))
+    thinned = _thinned(a)
     for package in sorted({*_versions(a), *_versions(b)}):
         x, y = _versions(a).get(package), _versions(b).get(package)
         if x != y:
@@ -204,15 +206,19 @@ def _runs(report: Report, a: Run, b: Run, tolerances: Tolerances, names: dict[st
     _scenarios(report, a.scenario, b.scenario)
     for table in ("trains", "units", "links"):
         if a.files(table) and b.files(table):
-            report.tables.append(compare(our_table(a, table), our_table(b, table), tolerances, names, thinned))
+            report.tables.append(compare(our_table(a, table), our_table(b, table), tolerances, names, table in thinned))
         elif a.files(table) or (b.files(table) and not thinned):
             report.files.append(f"{table}: only in {'A' if a.files(table) else 'B'}")
-    if not thinned or (a.folder / "events.jsonl").exists():
-        report.tables.append(compare(our_events(a, {}), our_events(b, dict(names)), tolerances, {}, False))
+    report.tables.append(compare(our_events(a, {}), our_events(b, dict(names)), tolerances, {}))
     if a.info.get("backend") == b.info.get("backend"):
         _folders(report, a.folder / "sumo", b.folder / "sumo", tolerances, names, thinned)
     else:
         _note(report, f"backend {a.info.get('backend')} -> {b.info.get('backend')}: SUMO's logs are not compared")
+
+
+def _thinned(run: Run) -> Collection[str]:
+    named = run.info.get(THINNED)
+    return [str(name) for name in named] if isinstance(named, list) else []
 
 
 def _versions(run: Run) -> Mapping[str, Any]:

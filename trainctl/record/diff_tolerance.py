@@ -37,7 +37,8 @@ CLOCKS = {
     },
 }  # fmt: skip
 
-_KEYS = ("absolute", "relative", "ignore")
+#: Names that may stand before a column.
+TABLES = ("trains", "units", "links", "events", "fcd", "tripinfo", "summary", "statistics", "collisions", "vehroute")
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ def parse_tolerances(data: Mapping[str, Any], file: str = "tolerances") -> Toler
     table = data.get("columns", {})
     if isinstance(table, Mapping):
         for name, value in table.items():
-            inner = isinstance(value, Mapping) and not any(key in value for key in _KEYS)
+            inner = isinstance(value, Mapping) and name in TABLES
             for key, item in ((f"{name}.{k}", v) for k, v in value.items()) if inner else ((name, value),):
                 tolerance = _one(item, file, f"columns.{key}", found)
                 if tolerance is not None:
