@@ -26,16 +26,22 @@ class Motion(NamedTuple):
     extras: dict[str, Floats]  # further columns of the units, (U,) each
 
 
+def _slopes(p: Prepared) -> Floats:
+    """Where the line's slopes begin [m] and their rise / run, shape (G, 2); (0, 2) on a level line."""
+    slopes = np.column_stack([p.line.gradient.breaks, p.line.gradient.slope])
+    return slopes if slopes[:, 1].any() else np.zeros((0, 2))
+
+
 class Points:
     """Point trains under a sampled law."""
 
     def __init__(self, p: Prepared) -> None:
         self.step = p.scenario.run.step_s
-        self.constants = point.constants(p.plant_params, p.consists)
+        self.constants = point.constants(p.plant_params, p.consists, gradient=_slopes(p))
 
     def believed_resistance(self, own: Floats) -> Floats:
-        """Running resistance at the present speed [N/kg], shape (n,)."""
-        return point.resistance(own[:, 1], self.constants.davis)
+        """Running resistance and gradient at the present speed and place [N/kg], shape (n,)."""
+        return point.resistance(own[:, SPEED], self.constants.davis) + point.climbing(own[:, POSITION], self.constants.gradient)
 
     def advance(
         self, k: int, t: float, own: Floats, demand: Demand, links: Links | None, exchange: Exchange, disturbed: Disturbed
@@ -61,9 +67,7 @@ class Units:
         self.law: Any = shared if p.sampled else p.law
         self.period = p.scenario.topology.communication_period_s
         self.estimate: Floats = p.observer.initial(p.observer_params, p.own)
-        self.gradient = np.column_stack([p.line.gradient.breaks, p.line.gradient.slope])
-        if not self.gradient[:, 1].any():
-            self.gradient = np.zeros((0, 2))
+        self.gradient = _slopes(p)
         self.plant: Any
         if p.scenario.plant.kind == "coupled_units":
             self.plant = coupled_units.constants(p.plant_params, p.consists, self.gradient)

@@ -22,9 +22,10 @@ from pydantic import ValidationError
 
 import sumo_net
 from sumo_net import Line, LineError
-from trainctl import controllers, observers
+from trainctl import controllers, observers, prepare_line
 from trainctl.errors import InputError
 from trainctl.plants import actuated_units, disturbance, point, shared
+from trainctl.reference import Profile
 from trainctl.scenario import Event, Scenario, examine, mistakes, read
 from trainctl.signals import FORCE, POSITION, SPEED, Bounds, Consists, Floats, Ints, Links, Reference, Scene, leader_at
 from trainctl.topology import graph
@@ -246,6 +247,9 @@ def prepare(scenario: Scenario, file: str, folder: Path, known: Sequence[str] = 
     own = _initial(scenario, consists, getattr(plant, "STATES", 2))
     track = np.unique([t.track for t in scenario.train], return_inverse=True)[1].astype(np.int64)
     start = own[0, POSITION] - scenario.topology.first_slot_m
+    if scenario.reference.follow_line:
+        followed = attempt(prepare_line.followed, scenario, network and network[0], plan, consists, start)
+        scenario = scenario.model_copy(update={"reference": followed or Profile(speed_mps=scenario.train[0].speed_mps)})
     reference = scenario.reference.leader(start)
     first = graph.links(plan, graph.order_on_tracks(own[consists.first[:-1], POSITION], track), track)
     prepared = Prepared(
@@ -261,7 +265,7 @@ def prepare(scenario: Scenario, file: str, folder: Path, known: Sequence[str] = 
     ]  # fmt: skip
     if network is not None:
         prepared = replace(prepared, line=network[0], spec=network[1], net=network[2])
-        found += _long_enough(prepared)
+        found += [*_long_enough(prepared), *prepare_line.steep(prepared)]
     if found:
         # What follows from a key that is wrong already is not a mistake of its own.
         wrong = [line.partition(" = ")[0].partition(":")[0].rpartition(".")[2] for line in known]

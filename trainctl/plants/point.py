@@ -1,7 +1,8 @@
 """Trains as points: the exact discrete maps of fully_distributed, eq. (1), and robust_constrained, eqs. (1) and (4).
 
 Explicit Euler, as printed: the position moves with the *old* speed. Disturbances and clamps are those of robust_constrained;
-without them both maps are the same one.
+without them both maps are the same one. The gradient, which neither paper has, is a force every train knows and makes up for:
+it is in the input, and leaves the motion as it is unless the input is clamped.
 
 Symbols: R running resistance, a demanded acceleration, u input, w1, w2, w3 disturbances, S_U and S_V clamps to the sets of
 admissible inputs and speeds, T step.
@@ -14,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
 
-from trainctl.signals import POSITION, SPEED, Bools, Consists, Floats, Table
+from trainctl.signals import GRAVITY, POSITION, SPEED, Bools, Consists, Floats, Table
 
 
 class Params(Table):
@@ -48,6 +49,7 @@ class Constants(NamedTuple):
     input_upper: Floats  # m/s2
     speed_lower: Floats  # m/s
     speed_upper: Floats  # m/s
+    gradient: Floats  # (G, 2) position where a slope begins [m], rise / run; the first reaches back without end
 
 
 class Kick(NamedTuple):
@@ -73,7 +75,9 @@ class Moved(NamedTuple):
     clipped: Bools  # (n,) the train would have moved backwards
 
 
-def constants(params: Params, consists: Consists, resistance_factor: Floats | None = None) -> Constants:
+def constants(
+    params: Params, consists: Consists, resistance_factor: Floats | None = None, gradient: Floats | None = None
+) -> Constants:
     """Arrays of the plant; a train of several units gets the mean of their Davis coefficients, weighted by mass.
 
     Parameters
@@ -83,7 +87,9 @@ def constants(params: Params, consists: Consists, resistance_factor: Floats | No
     consists : Consists
         Units of all trains.
     resistance_factor : ndarray, shape (n,), optional
-        True over believed resistance; 1 if left out.
+        True over believed running resistance; 1 if left out.
+    gradient : ndarray, shape (G, 2), optional
+        Position where a slope begins [m], ascending, and its rise / run; flat if left out.
 
     Returns
     -------
@@ -102,6 +108,7 @@ def constants(params: Params, consists: Consists, resistance_factor: Floats | No
         input_upper=everywhere(params.input_upper_mps2, np.inf),
         speed_lower=everywhere(params.speed_lower_mps, -np.inf),
         speed_upper=everywhere(params.speed_upper_mps, np.inf),
+        gradient=np.zeros((0, 2)) if gradient is None else gradient,
     )
 
 
@@ -125,6 +132,15 @@ def resistance(speed: Floats, davis: Floats) -> Floats:
     As printed, so ``c0`` acts at standstill too: a clamp of the speed at 0 keeps a stopped train where it is.
     """
     return davis[:, 0] + davis[:, 1] * speed + davis[:, 2] * speed**2
+
+
+def climbing(position: Floats, gradient: Floats) -> Floats:
+    """Weight along the line per mass [N/kg], rising positive, of trains whose front is at ``position`` [m], shape (n,)."""
+    if len(gradient) == 0:
+        return np.zeros_like(position)
+    where = np.maximum(np.searchsorted(gradient[:, 0], position, side="right") - 1, 0)
+    force: Floats = GRAVITY * gradient[where, 1]
+    return force
 
 
 def lead(steps: int) -> float:
@@ -159,13 +175,13 @@ def advance(constants: Constants, own: Floats, acceleration: Floats, step: float
     Notes
     -----
     The order of (4): add w3, clamp the input, subtract the true resistance, add w2, clamp the speed. Departs from both papers
-    in one thing: a displacement below zero is clipped to 0, since trains on a network do not run backwards.
+    in two things: a displacement below zero is clipped to 0, since trains on a network do not run backwards, and the gradient.
     """
     x, v = own[:, POSITION], own[:, SPEED]
-    believed = resistance(v, constants.davis)
-    asked = believed + acceleration + kick.input
+    believed, climb = resistance(v, constants.davis), climbing(x, constants.gradient)
+    asked = believed + climb + acceleration + kick.input
     applied = np.clip(asked, constants.input_lower, constants.input_upper)
-    free = v + applied * step - constants.resistance_factor * believed * step + kick.speed
+    free = v + applied * step - (constants.resistance_factor * believed + climb) * step + kick.speed
     v_next = np.clip(free, constants.speed_lower, constants.speed_upper)
     moved = v * step + kick.position
     displacement = np.maximum(moved, 0.0)
