@@ -70,6 +70,7 @@ class Simulation:
         self.exchange = Exchange(loss=top.loss, delay=round(top.delay_s / period), radius=top.range_m or np.inf, seed=run.seed or 0)
         self.motion: Points | Units = Points(prepared) if prepared.scenario.plant.kind == "point" else Units(prepared)
         self.demand = Demand(np.zeros(n), np.zeros(n, bool))
+        self.outside = np.full(n, np.nan)
         self.alarms = monitor.Alarms(prepared)
         self.relinked: tuple[float, Floats, Links] | None = None
         self.between: Callable[[], Any] | None = None
@@ -89,6 +90,7 @@ class Simulation:
         disturbed = disturbance.at(self.signals, self.k, t, seen.position)
         if self.p.sampled and self.k % self.p.scenario.run.held_steps == 0:
             self.demand = self._protect(self._control(t, disturbed))
+        self.demand = self._from_outside(self.demand)
         before, past = self.own, self._past()
         self.own, motion = self.motion.advance(self.k, t, before, self.demand, self.links, self.exchange, disturbed)
         self._check(t, motion)
@@ -256,6 +258,13 @@ class Simulation:
             names = ", ".join(self.p.scenario.ids[i] for i in wrong)
             raise LawError(f"law {self.p.scenario.controller.law} gave a number that is not finite for train {names} at {t:g} s")
         return demand
+
+    def _from_outside(self, demand: Demand) -> Demand:
+        """Accelerations that somebody outside has set (not NaN) take the place of the law's."""
+        free = np.isnan(self.outside)
+        if free.all():
+            return demand
+        return self._protect(Demand(np.where(free, demand.acceleration, self.outside), demand.saturated & free))
 
     def _protect(self, demand: Demand) -> Demand:
         """Speed and input clamps of a law whose model has them, for trains of units (point trains clamp in the plant)."""

@@ -441,7 +441,10 @@ def _room(scenario: Scenario, consists: Consists) -> tuple[Floats, Floats]:
 
 
 def _resolved(scenario: Scenario, bounds: Bounds) -> Scenario:
-    """The scenario with the input bounds that follow from the units written down, for the metrics and whoever reads the log."""
+    """The scenario as it is logged: with the input bounds that follow from the units, and a law's file by its name alone."""
+    law = scenario.controller.law
+    if law.endswith(".py"):  # a copy of it stands beside the scenario
+        scenario = scenario.model_copy(update={"controller": scenario.controller.model_copy(update={"law": Path(law).name})})
     if not np.all(np.isfinite(bounds.input_lower) & np.isfinite(bounds.input_upper)):
         return scenario
     low, high = bounds.input_lower.tolist(), bounds.input_upper.tolist()

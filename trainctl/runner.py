@@ -119,6 +119,7 @@ def opened(
         info = about_run(text, p.scenario.run.seed or 0, command_line or sys.argv, backend=backend)
         write_info(partial, info)
         (partial / "scenario.toml").write_text(text, encoding="utf-8")
+        keep_law(p, partial)
         begin(partial, p, checkpoint_every_s)
         with _driven(p, partial, info, gui, checkpoint_every_s, None) as simulation:
             yield simulation
@@ -253,12 +254,13 @@ class _Between:
             simulation, journal, tape, place, stop, elapsed,
         )  # fmt: skip
         self.every = round(every_s / simulation.p.scenario.run.step_s) if every_s is not None else 0
+        self.identity = checkpoint.identity(simulation.p) if tape is not None else {}
 
     def __call__(self) -> None:
         asked = self.stop.asked
         if self.tape is not None and (asked is not None or self.simulation.k % self.every == 0):
             more = {"recorder": self.journal.recorder.cut(), "tape": self.tape.save(), "wall_time_s": self.elapsed()}
-            checkpoint.write(self.place, self.simulation, more)
+            checkpoint.write(self.place, self.simulation, {**self.identity, **more})
         if asked is not None:
             raise KeyboardInterrupt(f"interrupted by {asked}")
 
@@ -291,10 +293,17 @@ def _stops() -> Iterator[_Stop]:
             signal.signal(number, handler)
 
 
+def keep_law(p: Prepared, folder: Path) -> None:
+    """A law that came as a file stands beside the scenario that names it."""
+    if p.scenario.controller.law.endswith(".py"):
+        shutil.copyfile(p.law.__file__, folder / p.scenario.controller.law)
+
+
 def begin(partial: Path, p: Prepared, every_s: float | None) -> None:
     """Put down what ``again`` needs, with the network as it was read."""
     place = partial / checkpoint.FOLDER
     place.mkdir()
+    keep_law(p, place)
     start: dict[str, Any] = {"file": p.file, "checkpoint_every_s": every_s}
     if p.net is not None:
         start["net"] = p.net.name

@@ -1,0 +1,350 @@
+"""The package from Python: run a scenario and look at it, or drive it step by step.
+
+>>> run = trainctl.run("three_tracks", **{"run.duration_s": 60})     # doctest: +SKIP
+>>> run.trains, run.metrics, run.plot.spacing()                      # doctest: +SKIP
+
+SUMO holds one simulation per process: close one before opening the next.
+"""
+
+from __future__ import annotations
+
+import html
+import tempfile
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from functools import cached_property
+from io import BytesIO
+from itertools import pairwise
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from trainctl import runner
+from trainctl.errors import InputError
+from trainctl.prepare import open_scenario
+from trainctl.record import run as recorded
+from trainctl.runner import Backend
+from trainctl.scenario import Event
+from trainctl.signals import POSITION, SPEED, Floats
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from trainctl import loop
+
+#: What a run tells of itself in a notebook: metric -> words.
+HEADLINES = {
+    "bounds.broken": "kinds of bound broken",
+    "bounds.spacing_lower_margin_m": "least spacing above its lower bound [m]",
+    "bounds.spacing_upper_margin_m": "least room below the upper spacing bound [m]",
+    "formation.settling_s": "all links within 1 m from [s]",
+    "formation.final_error_m": "largest spacing error at the end [m]",
+}
+
+
+def run(
+    scenario: str | Path = "three_tracks",
+    *,
+    backend: Backend = "sumo",
+    out: str | Path | None = None,
+    force: bool = False,
+    progress: Callable[[int, int], Any] | None = None,
+    **settings: Any,
+) -> Run:
+    """Run a scenario, as `trainctl run` does.
+
+    Parameters
+    ----------
+    scenario : str or Path
+        Name of a shipped scenario, or path of a TOML.
+    backend : {"sumo", "numeric"}
+        SUMO, or the same loop without a simulator.
+    out : Path, optional
+        Run folder; default ``runs/NAME``. A run of ours there is replaced.
+    force : bool
+        Replace whatever lies there.
+    progress : callable, optional
+        Called with (steps done, steps).
+    **settings
+        Keys of the scenario to override: ``**{"run.duration_s": 60}``.
+
+    Raises
+    ------
+    InputError
+        Everything that is wrong with the scenario.
+    TrainctlError
+        The run failed.
+    """
+    folder = Path("runs") / Path(scenario).stem if out is None else Path(out)
+    runner.run(open_scenario(str(scenario), settings), folder, backend, force, ("trainctl.run",), progress)
+    return Run(folder)
+
+
+def open(folder: str | Path) -> Run:
+    """Open a run folder."""
+    return Run(folder)
+
+
+class Run(recorded.Run):
+    """A run folder in a notebook: tables as DataFrames (``trains``, ``units``, ``links``), ``events``, ``metrics``, ``plot``."""
+
+    @cached_property
+    def plot(self) -> Plots:
+        """Figures by name: ``run.plot.spacing()``."""
+        return Plots(self)
+
+    def _repr_html_(self) -> str:
+        rows = [("folder", str(self.folder)), ("status", str(self.info.get("status")))]
+        if (self.folder / "scenario.toml").is_file():
+            law, plant = self.scenario["controller"]["law"], self.scenario.get("plant", {}).get("kind", "point")
+            rows += [
+                ("scenario", self.scenario["title"]),
+                ("law, plant", f"{law} on {plant}, {len(self.scenario['train'])} trains"),
+            ]
+        if (self.folder / "metrics.json").is_file():
+            known = ((words, self.metrics.get(key)) for key, words in HEADLINES.items())
+            rows += [(words, f"{value:.6g}") for words, value in known if isinstance(value, int | float)]
+        cells = "".join(f"<tr><th style='text-align:left'>{html.escape(a)}</th><td>{html.escape(b)}</td></tr>" for a, b in rows)
+        return f"<table>{cells}</table>"
+
+
+class Plots:
+    """The figures of a run: ``plot.NAME(width="double")`` is a matplotlib figure; ``dir(plot)`` lists those that apply."""
+
+    def __init__(self, run: recorded.Run) -> None:
+        self._run = run
+
+    def __dir__(self) -> list[str]:
+        from trainctl.record import figures, style
+
+        with style.styled():
+            return sorted(figures.applicable(figures.prepare(self._run, "double")))
+
+    def __getattr__(self, name: str) -> Callable[..., Figure]:
+        from trainctl.record import figures
+
+        if name not in figures.FIGURES:
+            raise AttributeError(f"no figure {name}; there are: {', '.join(figures.FIGURES)}")
+
+        def draw(width: str = "double") -> Figure:
+            figure = figures.figure(self._run, name, width)
+            # A notebook shows what has this; figures made without pyplot have it not.
+            figure._repr_png_ = lambda: _png(figure)  # type: ignore[attr-defined]
+            return figure
+
+        draw.__name__ = name
+        draw.__doc__ = figures.FIGURES[name].__doc__
+        return draw
+
+
+def _png(figure: Figure) -> bytes:
+    out = BytesIO()
+    figure.savefig(out, format="png", dpi=110)
+    return out.getvalue()
+
+
+class Simulation:
+    """A scenario step by step, for loops of your own.
+
+    >>> with trainctl.Simulation.open("three_tracks", **{"run.duration_s": 60}) as sim:     # doctest: +SKIP
+    ...     while not sim.done:
+    ...         sim.command({"2": -0.05})
+    ...         sim.step()
+
+    Attributes
+    ----------
+    trains : tuple of str
+        Ids, in the order of all arrays.
+    """
+
+    def __init__(self, stack: ExitStack, simulation: loop.Simulation, out: Path | None) -> None:
+        self._stack, self._loop, self._out = stack, simulation, out
+        self._open = True
+        self.trains: tuple[str, ...] = tuple(simulation.p.scenario.ids)
+
+    @classmethod
+    def open(
+        cls,
+        scenario: str | Path = "three_tracks",
+        *,
+        backend: Backend = "sumo",
+        out: str | Path | None = None,
+        force: bool = False,
+        **settings: Any,
+    ) -> Simulation:
+        """Put the trains on the line, at time 0.
+
+        Parameters
+        ----------
+        scenario, backend, force, **settings
+            As in ``run``.
+        out : Path, optional
+            Run folder; default none, nothing stays.
+        """
+        prepared = open_scenario(str(scenario), settings)
+        with ExitStack() as stack:
+            if out is None:
+                folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="trainctl."))) / "run"
+            else:
+                folder = Path(out)
+            opened = runner.opened(prepared, folder, backend, force, ("trainctl.Simulation",))
+            simulation = stack.enter_context(opened)
+            return cls(stack.pop_all(), simulation, Path(out) if out is not None else None)
+
+    @property
+    def time(self) -> float:
+        """Scenario time of the present state [s]."""
+        return self._loop.time
+
+    @property
+    def done(self) -> bool:
+        """Whether run.duration_s is reached."""
+        return self._loop.k >= self._loop.p.scenario.run.steps
+
+    @property
+    def position_m(self) -> Floats:
+        """Front of every train on the line, shape (n,)."""
+        return self._loop.world.measure().position.copy()
+
+    @property
+    def speed_mps(self) -> Floats:
+        """Speed of every train's head, shape (n,)."""
+        return np.asarray(self._loop.own[self._loop.p.heads, SPEED].copy())
+
+    @property
+    def track(self) -> list[str]:
+        """Track every train is on."""
+        line = self._loop.p.line
+        return [line.tracks[k] for k in self._loop.world.measure().edge]
+
+    @property
+    def reference(self) -> tuple[float, float]:
+        """Position [m] and speed [m/s] of the reference now."""
+        position, speed = self._loop.p.leader(self.time)[:2]
+        return float(position), float(speed)
+
+    @property
+    def state(self) -> pd.DataFrame:
+        """One row per train: train, track, position_m, speed_mps."""
+        return pd.DataFrame({"train": self.trains, "track": self.track, "position_m": self.position_m, "speed_mps": self.speed_mps})
+
+    @property
+    def units(self) -> pd.DataFrame:
+        """One row per unit: train, unit, position_m, speed_mps."""
+        first, own = self._loop.p.consists.first, self._loop.own
+        names = [(name, k + 1) for name, (a, b) in zip(self.trains, pairwise(first), strict=True) for k in range(b - a)]
+        frame = pd.DataFrame(names, columns=["train", "unit"])
+        return frame.assign(position_m=own[:, POSITION], speed_mps=own[:, SPEED])
+
+    @property
+    def links(self) -> pd.DataFrame:
+        """Who hears whom in the last step: sender, receiver, spacing_m, desired_m, lower_m, upper_m, heard."""
+        links = self._loop.links
+        if links is None:  # before the first step
+            links = self._loop.p.first_links
+        names, x = np.array(self.trains, dtype=object), self.position_m
+        return pd.DataFrame(
+            {
+                "sender": names[links.sender], "receiver": names[links.receiver],
+                "spacing_m": x[links.sender] - x[links.receiver], "desired_m": links.desired, "lower_m": links.lower,
+                "upper_m": links.upper, "heard": links.heard,
+            }
+        )  # fmt: skip
+
+    def step(self, steps: int = 1) -> float:
+        """Go on by so many steps; returns the time [s]."""
+        for _ in range(steps):
+            if not self._open or self.done:
+                raise InputError(f"the simulation has ended at {self.time:g} s: run.duration_s says how long it can go on")
+            self._guard(self._loop.step)
+        return self.time
+
+    def command(self, acceleration_mps2: Mapping[str, float]) -> None:
+        """Drive trains from outside: from the next step on they are asked for this acceleration, not for the law's.
+
+        The limits of the plant, and a law's own clamps of speed and input, still apply.
+
+        Parameters
+        ----------
+        acceleration_mps2 : mapping of str to float
+            By train id; stays until it is changed or released.
+        """
+        if not self._loop.p.sampled:
+            law = self._loop.p.scenario.controller.law
+            raise InputError(f"law {law} is evaluated inside the integrator: only trains under a sampled law can be commanded")
+        numbers = [self._number(train) for train in acceleration_mps2]
+        values = np.array([float(a) for a in acceleration_mps2.values()])
+        if not np.isfinite(values).all():
+            raise InputError("acceleration_mps2: must be finite")
+        self._loop.outside[numbers] = values
+
+    def release(self, *trains: str) -> None:
+        """Give trains back to the law, from its next control instant on; without names, all."""
+        self._loop.outside[[self._number(t) for t in trains] if trains else slice(None)] = np.nan
+
+    def reroute(self, train: str, *, to_track: str | None = None, crossover: str | None = None) -> None:
+        """Order a train onto another track: over the next crossover to it, or over one named.
+
+        Raises
+        ------
+        InputError
+            There is no such crossover ahead on the train's track.
+        """
+        i, line = self._number(train), self._loop.p.line
+        if (to_track is None) == (crossover is None):
+            raise InputError("reroute: give either to_track or crossover")
+        seen = self._loop.world.measure()
+        edge, position = int(seen.edge[i]), float(seen.position[i])
+        try:
+            if to_track is not None:
+                ahead = line.next_crossover(line.tracks[edge], position, str(to_track))
+                if ahead is None:
+                    raise ValueError(f"no crossover from track {line.tracks[edge]} to {to_track} ahead of {position:.1f} m")
+                crossover = ahead.id
+            line.route_over(line.edges[edge], str(crossover))
+        except ValueError as error:
+            raise InputError(f"reroute of train {train}: {error}") from None
+        event = Event(kind="reroute", train=str(train), crossover=str(crossover), time_s=self.time)
+        self._loop.pending.insert(0, (len(self._loop.p.scenario.event) + 1, event))
+
+    def close(self) -> Run | None:
+        """End the simulation; the run folder, if ``out`` was given."""
+        if self._open:
+            self._guard(self._loop.end)
+            self._open = False
+            self._stack.close()
+        return Run(self._out) if self._out is not None else None
+
+    def __enter__(self) -> Simulation:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if kind is None:
+            self.close()
+        elif self._open:
+            self._open = False
+            self._stack.__exit__(kind, error, trace)
+
+    def __repr__(self) -> str:
+        """Where it stands."""
+        law = self._loop.p.scenario.controller.law
+        return (
+            f"Simulation({self._loop.p.file}: {law}, {len(self.trains)} trains, {self.time:g} s{'' if self._open else ', closed'})"
+        )
+
+    def _number(self, train: str) -> int:
+        if str(train) not in self.trains:
+            raise InputError(f"train {train}: no such train; there are: {', '.join(self.trains)}")
+        return self.trains.index(str(train))
+
+    def _guard(self, action: Callable[[], Any]) -> None:
+        """Do something in the loop; if it fails, the run has failed."""
+        try:
+            action()
+        except BaseException as error:
+            self._open = False
+            self._stack.__exit__(type(error), error, error.__traceback__)
+            raise
