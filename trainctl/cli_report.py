@@ -131,7 +131,7 @@ def claims(
     """Measure every claim of the papers: what they state, what comes out here, the verdict and the correction."""
     import sys
 
-    from trainctl.claims import PAPERS, as_markdown, measure
+    from trainctl.claims import NOT, PAPERS, REPRODUCED, WITH_CORRECTION, as_markdown, measure
     from trainctl.cli import _print, _print_json, _progress, _table
 
     if paper is not None and paper not in PAPERS:
@@ -143,7 +143,18 @@ def claims(
     elif markdown:
         print(as_markdown(found))
     else:
-        table = _table(None, "paper", "claim", "paper's value", "measured", "unit", "verdict", "note")
-        for claim in found:
-            table.add_row(*(_shown(value) for value in claim))
-        _print(table)
+        from rich.text import Text
+
+        colours = {REPRODUCED: "green", WITH_CORRECTION: "yellow", NOT: "red"}
+        for name in dict.fromkeys(claim.paper for claim in found):
+            table = _table(f"{name}: {PAPERS[name]}")
+            for column, share in (("claim", 5), ("paper", 2), ("measured", 2), ("unit", None), ("verdict", None), ("note", 5)):
+                table.add_column(column, ratio=share, overflow="fold")
+            for claim in found:
+                if claim.paper == name:
+                    cells = [Text(_shown(value)) for value in claim[1:]]
+                    cells[4].stylize(colours[claim.verdict])
+                    table.add_row(*cells)
+            _print(table)
+        counts = [f"{sum(c.verdict == verdict for c in found)} {verdict}" for verdict in (REPRODUCED, WITH_CORRECTION, NOT)]
+        print(f"{len(found)} claims: {', '.join(counts)}")

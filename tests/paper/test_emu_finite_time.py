@@ -6,119 +6,23 @@ All without simulator: plant and law integrated jointly.
 from __future__ import annotations
 
 import time
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from trainctl.claims.emu_finite_time import (
+    CONSENSUS,
+    RETUNED,
+    SPEEDS,
+    History,
+    group,
+    run,
+)
 from trainctl.controllers import emu_finite_time as law
 from trainctl.observers import none
 from trainctl.plants import coupled_units, integrate, shared
-from trainctl.signals import Bounds, Consists, Floats, Links, Reference, Scene
-
-KMH = 1.0 / 3.6
-DAVIS = (0.01176, 7.7616e-4, 1.6e-5)
-SPEEDS = (316 * KMH, 342 * KMH, 324 * KMH)  # (17)
-RETUNED = law.Params(mu_2=0.3, p_4=0.1)
-CONSENSUS = law.Params(alpha_1=1.0)
-
-
-def leader(start: float) -> Reference:
-    """The profile (17): speed switched where the leader passes km 161 and 294, held after km 450."""
-    breaks, pieces = [0.0], []
-    for speed, until in zip(SPEEDS, (161e3, 294e3, 450e3), strict=True):
-        pieces.append([start, speed])
-        breaks.append(breaks[-1] + (until - start) / speed)
-        start = until
-    return Reference(np.array(breaks), np.array(pieces))
-
-
-def group(
-    trains: int = 3, units: int = 4, limits: bool = False, leader_at: float = 109e3,
-    heads: tuple[float, ...] = (108.8e3, 105e3, 102.2e3),
-    speeds: tuple[float, ...] = (295 * KMH, 275 * KMH, 285 * KMH),
-) -> Scene:  # fmt: skip
-    """The paper's trains, slots 3000 m apart tail to head."""
-    rows = trains * units
-    one, endless = np.ones(rows), np.full(rows, np.inf)
-    coupled = np.arange(1, rows + 1) % units != 0
-    consists = Consists(
-        np.arange(0, rows + 1, units), 80.0 * one, 8e4 * one, one.copy(), np.tile(DAVIS, (rows, 1)), 1.6e5 * coupled,
-        600.0 * coupled, 4e4 * one if limits else endless, 2.4e6 * one if limits else endless, 6.4e4 * one if limits else endless,
-        endless, endless,
-    )  # fmt: skip
-    pairs = [(j, i) for i in range(trains) for j in (i - 1, i + 1) if 0 <= j < trains]
-    sender, receiver = np.array(pairs, dtype=np.int64).reshape(-1, 2).T.copy()
-    spacing, some = 3000.0 + 80.0 * units, np.ones(len(pairs))
-    links = Links(
-        sender, receiver, np.searchsorted(receiver, np.arange(trains + 1)), (receiver - sender) * spacing, -np.inf * some,
-        np.inf * some, some, some > 0.0, -spacing * np.arange(trains), np.arange(trains),
-    )  # fmt: skip
-    own = np.empty((rows, 2))
-    own[:, 0] = (np.array(heads)[:, None] - 80.0 * np.arange(units)).ravel()
-    own[:, 1] = np.repeat(speeds, units)
-    free = np.full(trains, np.inf)
-    names = [str(i + 1) for i in range(trains)]
-    return Scene(names, consists, own, links, Bounds(-free, free, -free, free), leader(leader_at), 0.0, 1.0, 1.0, 0.5, 0.01)
-
-
-class History(NamedTuple):
-    """States once a second, extremes over all sub-steps."""
-
-    scene: Scene
-    own: Floats  # (seconds + 1, U, 2)
-    extremes: integrate.Extremes
-    wall: float  # s
-
-    def intervals(self) -> Floats:
-        """Clear distances [m], shape (seconds + 1, 2)."""
-        return self.own[:, [3, 7], 0] - 80.0 - self.own[:, [4, 8], 0]
-
-    def couplers(self) -> tuple[float, float]:
-        """Least and largest coupler displacement [m] over all sub-steps."""
-        inner = np.isfinite(self.extremes.coupler_min)
-        return float(self.extremes.coupler_min[inner].min()), float(self.extremes.coupler_max[inner].max())
-
-    def settled(self, band: float, since: int = 0, until: int = 592, speed: float = SPEEDS[0]) -> int:
-        """Seconds after ``since`` from which all unit speeds stay within ``band`` [m/s] of ``speed``."""
-        outside = np.abs(self.own[since : until + 1, :, 1] - speed).max(axis=1) > band
-        return int(np.nonzero(outside)[0][-1]) + 1
-
-
-def run(
-    scene: Scene, seconds: int, params: law.Params | None = None, step: float = 0.01, period: float | None = None
-) -> History:
-    """Integrate law and plant; ``period`` holds the messages between trains for that long."""
-    params = params or law.Params()
-    links, own, estimate = scene.links, scene.own.copy(), np.zeros((len(scene.own), 0))
-    loop = integrate.Loop(
-        law.constants(params, scene), none.Constants(), coupled_units.constants(coupled_units.Params(), scene.consists)
-    )
-    air = integrate.Air(np.zeros((len(links.sender), law.MESSAGE)), period is None, False, 0.0)
-    work = integrate.scratch(own, estimate, len(scene.trains), none.CORRECTIONS, law.MESSAGE)
-    extremes = integrate.Extremes.fresh(len(scene.trains), len(own), len(law.WATCHED))
-    first, length, reference = scene.consists.first, scene.consists.length, scene.reference
-    breaks = reference.breaks[1:-1].copy()
-
-    def arguments(t: float, n: int) -> tuple[object, ...]:
-        return loop, first, length, links, reference, air, t, step, n, breaks, own, estimate, work, extremes
-
-    parts = integrate.compiled(law, none, coupled_units, arguments(0.0, 1))
-    states = np.empty((seconds + 1, *own.shape))
-    states[0] = own
-    began = time.perf_counter()
-    share = 1.0 if period is None else min(period, 1.0)
-    for k in range(round(seconds / share)):
-        t = k * share
-        if period is not None and k % round(period / share) == 0:
-            integrate.exchange(parts, loop, first, links, reference, air, t, own, estimate, work)
-            air.heard[:] = work.sent[links.sender]
-            air = air._replace(sent_at=t)
-        integrate.advance(parts, *arguments(t, round(share / step)))  # type: ignore[arg-type]
-        if (k + 1) % round(1.0 / share) == 0:
-            states[round((k + 1) * share)] = own
-    return History(scene, states, extremes, time.perf_counter() - began)
+from trainctl.signals import Floats, Reference
 
 
 @pytest.fixture(scope="module")

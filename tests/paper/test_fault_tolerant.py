@@ -6,155 +6,25 @@ Everything here runs the compiled stage itself, without a simulator. What was me
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from trainctl.claims.fault_tolerant import (
+    EDGES,
+    FRONT,
+    NOISY,
+    REAR,
+    Example,
+    paper_faults,
+    paper_scene,
+    total_failure,
+)
 from trainctl.controllers import fault_tolerant as law
 from trainctl.observers import asymptotic, intermediate
 from trainctl.plants import actuated_units as plant
 from trainctl.plants import integrate
-from trainctl.plants.faults import Fault, breaks
-from trainctl.reference import s_curves
-from trainctl.signals import Bounds, Consists, Links, Scene
-
-CURVES = [
-    (60.0, 240.0, 55.0), (400.0, 540.0, 80.0), (700.0, 800.0, 92.0), (1060.0, 1200.0, 65.0),
-    (1360.0, 1480.0, 85.0), (1700.0, 1880.0, 50.0), (2020.0, 2140.0, 72.0), (2280.0, 2440.0, 40.0),
-]  # fmt: skip
-POSITION = [13062.0, 13036.0, 13010.0, 5157.0, 5131.0, 5105.0, 52.0, 26.0, 0.0]  # Table 2
-SPEED = [20.5, 20.2, 20.3, 19.8, 19.9, 20.5, 19.7, 20.5, 20.2]
-CONSTANT = [(4, 14), (6, 15), (8, 16), (10, 17), (12, 18), (14, 19), (16, 20), (18, 21), (20, 22)]  # Table 3, 100 s
-SINUSOID = [(5, 23), (7, 23), (9, 23), (11, 23), (13, 23), (15, 23), (17, 23), (19, 23), (21, 23)]
-EDGES = sorted({100.0 * e for window in CONSTANT + SINUSOID for e in window})
-FRONT, REAR = [0, 1, 3, 4, 6, 7], [1, 2, 4, 5, 7, 8]  # adjacent carriages of one train
-NOISY = plant.Params(noise_variance_m2_per_s6=0.5)
-
-
-def paper_faults() -> list[Fault]:
-    found = []
-    for k, (constant, wave) in enumerate(zip(CONSTANT, SINUSOID, strict=True)):
-        i, j = k // 3 + 1, k % 3 + 1
-        place = {"train": i, "unit": j, "amplitude_n_per_s": 2e5}
-        found.append(Fault(**place, kind="constant", start_s=100.0 * constant[0], end_s=100.0 * constant[1]))
-        window = {"start_s": 100.0 * wave[0], "end_s": 100.0 * wave[1]}
-        found.append(Fault(**place, **window, kind="sinusoid", omega_rad_per_s=1.0, phase_rad=6.0 * (i - 1) + 2.0 * j))
-    return found
-
-
-def total_failure(train: int, unit: int, left: float = 0.0) -> Fault:
-    return Fault(train=train, unit=unit, kind="effectiveness", effectiveness=left, start_s=800.0)
-
-
-def paper_scene(sub_step: float = 0.01, force_limit: float = math.inf) -> Scene:
-    one = np.ones(9)
-    consists = Consists(
-        first=np.array([0, 3, 6, 9]), length=26.0 * one, mass=8e4 * one, rotating=one, davis=np.tile([0.01176, 0.00077616, 1.6e-5], (9, 1)),
-        stiffness=np.array([1.6e5, 1.6e5, 0.0] * 3), damping=np.array([600.0, 600.0, 0.0] * 3), traction=force_limit * one,
-        traction_power=math.inf * one, braking=force_limit * one, braking_power=math.inf * one, actuator_rate=50.0 * one,
-    )  # fmt: skip
-    links = Links(  # front to front: 7053 m from the tail carriage and 52 m of train
-        sender=np.array([0, 1]), receiver=np.array([1, 2]), first=np.array([0, 0, 1, 2]), desired=np.full(2, 7105.0),
-        lower=np.full(2, 4754.0), upper=np.full(2, 9052.0), weight=np.ones(2), heard=np.ones(2, bool),
-        slot=np.array([-7053.0, -14158.0, -21263.0]), order=np.array([0, 1, 2]),
-    )  # fmt: skip
-    own = plant.balanced(np.column_stack([POSITION, SPEED]), consists)
-    b = np.full(3, math.inf)
-    reference = s_curves(20115.0, 20.0, CURVES)
-    return Scene(("1", "2", "3"), consists, own, links, Bounds(-b, b, -b, b), reference, 0.0, 1.0, 1.0, 0.5, sub_step)
-
-
-@dataclass
-class Example:
-    """The closed loop of the example, and its history once a second."""
-
-    scene: Scene = field(default_factory=paper_scene)
-    observer: Any = asymptotic
-    observer_params: Any = None
-    faults: list[Fault] = field(default_factory=paper_faults)
-    params: law.Params = field(default_factory=law.Params)
-    seed: int | None = None
-    period: float | None = None  # of communication
-    printed_D1: bool = False
-    printed_l4: bool = False
-
-    def run(self, duration: float, every: float = 1.0) -> Example:
-        s, c = self.scene, self.scene.consists
-        observer_params = self.observer_params or self.observer.Params()
-        law_constants, observer_constants = law.constants(self.params, s), self.observer.constants(observer_params, s)
-        if self.printed_l4:
-            law_constants = law_constants._replace(ell4=-law_constants.ell4)
-        if self.printed_D1:  # D1 without -r v is the corrected observer with k2 - r: mu2 and zeta become the same
-            observer_constants = observer_constants._replace(k2=observer_constants.k2 - 50.0)
-        moving = plant.constants(NOISY, c, faults=self.faults, trains=s.trains)
-        loop = integrate.Loop(law_constants, observer_constants, moving)
-        own, estimate = s.own.copy(), self.observer.initial(observer_params, s.own)
-        air = integrate.Air(np.zeros((2, law.MESSAGE)), self.period is None, True, 0.0)
-        work = integrate.scratch(own, estimate, 3, self.observer.CORRECTIONS, law.MESSAGE)
-        self.extremes = integrate.Extremes.fresh(3, 9, 3)
-        split = np.unique(np.concatenate([breaks(self.faults), s.reference.breaks[1:-1]]))
-        sizes = [every, *([self.period] if self.period else []), *([NOISY.noise_hold_s] if self.seed is not None else [])]
-        chunk, h = min(sizes), s.sub_step
-        n = round(chunk / h)
-        parts = integrate.compiled(
-            law, self.observer, plant,
-            (loop, c.first, c.length, s.links, s.reference, air, 0.0, h, n, split, own, estimate, work, self.extremes),
-        )  # fmt: skip
-        history = []
-        for k in range(round(duration / chunk)):
-            t = k * chunk
-            if self.seed is not None:
-                moving.units[:, plant.NOISE] = plant.noise(NOISY, self.seed, round(t / NOISY.noise_hold_s), 9)
-            if self.period and k % round(self.period / chunk) == 0:  # nothing has been heard yet at the start: the exact chain
-                integrate.exchange(
-                    parts, loop, c.first, s.links, s.reference, air._replace(live=k == 0), t, own, estimate, work
-                )  # fmt: skip
-                air.heard[:] = work.sent[s.links.sender]
-                air = air._replace(sent_at=t)
-            if k % round(every / chunk) == 0:
-                history.append((t, own.copy(), estimate.copy(), self.observer.fault_estimate(observer_constants, estimate)))
-            applied = integrate.advance(
-                parts, loop, c.first, c.length, s.links, s.reference, air, t, h, n, split, own, estimate, work, self.extremes
-            )
-            if k % round(every / chunk) == 0:
-                history[-1] += (plant.fault(moving, t, applied),)
-            if not np.isfinite(own).all():
-                break
-        self.own, self.finite = own, bool(np.isfinite(own).all())
-        self.time = np.array([row[0] for row in history])
-        self.positions = np.array([row[1][:, 0] for row in history])
-        self.speeds = np.array([row[1][:, 1] for row in history])
-        self.fault_error = np.array([row[3] - row[4] for row in history])
-        return self
-
-    @property
-    def inside(self) -> bool:
-        """R2 and R3 at every sub-step."""
-        low, high = self.extremes.watched_min, self.extremes.watched_max
-        return bool(
-            self.finite and (low[:, 0] > -2351.0).all() and (high[:, 0] < 1947.0).all()
-            and (low[:, 1] > -50.0).all() and (high[:, 1] < 50.0).all()
-        )  # fmt: skip
-
-    def distances(self) -> np.ndarray:
-        """Tail carriage to the head behind at the end [m]."""
-        return self.own[[2, 5], 0] - self.own[[3, 6], 0]
-
-    def spacing(self) -> np.ndarray:
-        """Adjacent carriages at the end [m]."""
-        return self.own[FRONT, 0] - self.own[REAR, 0]
-
-    def ripple(self, away: float = 0.0) -> tuple[float, float]:
-        """RMS of carriage spacing [m] and speed differences [m/s] after 400 s, without ``away`` seconds after window edges."""
-        kept = self.time >= 400.0
-        for edge in EDGES if away else []:
-            kept &= ~((self.time >= edge) & (self.time < edge + away))
-        ds = self.positions[kept][:, FRONT] - self.positions[kept][:, REAR] - 26.0
-        dv = self.speeds[kept][:, FRONT] - self.speeds[kept][:, REAR]
-        return float(np.sqrt((ds**2).mean())), float(np.sqrt((dv**2).mean()))
 
 
 @pytest.fixture(scope="module")

@@ -6,134 +6,25 @@ its parameters. Where the print is wrong the reading is named.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import pytest
 
+from trainctl.claims.fully_distributed import (
+    AFTER,
+    BEFORE,
+    END,
+    SWITCH,
+    TOPOLOGIES,
+    V_R,
+    Edge,
+    History,
+    N,
+    next_to,
+    run,
+    scene,
+    two_apart,
+)
 from trainctl.controllers import fully_distributed as law
-from trainctl.plants import point
-from trainctl.signals import Bounds, Consists, Floats, Links, Reference, Scene, Trains
-
-V_R, T, SWITCH, END = 80.0, 1.0, 1000, 2400
-DAVIS = np.array([1.176e-2, 7.7616e-4, 1.6e-5])
-START = np.array([[24000.0, 85.0], [21000.0, 82.0], [13000.0, 81.0], [12000.0, 81.0], [9000.0, 80.0], [0.0, 76.0]])
-N = len(START)
-
-Edge = tuple[int, int, float, float, float]  # train ahead, train behind, desired, lower, upper
-
-
-def next_to(a: int, b: int, upper: float = 10000.0) -> Edge:
-    return a, b, 5000.0, 100.0, upper  # 1000 in the print contradicts its own Assumption 2.2: d = 5000
-
-
-def two_apart(a: int, b: int) -> Edge:
-    return a, b, 10000.0, 5100.0, 15000.0
-
-
-BEFORE = [next_to(1, 2), next_to(2, 3), next_to(3, 4), two_apart(4, 6)]
-AFTER = [two_apart(1, 3), next_to(3, 4), next_to(4, 5), next_to(5, 6)]
-TOPOLOGIES = {"line": (BEFORE, AFTER), "not a line": ([*BEFORE, two_apart(1, 3)], [*AFTER, two_apart(4, 6)])}
-
-
-def links_of(edges: list[Edge]) -> Links:
-    rows = [(b - 1, a - 1, d, lo, hi) for a, b, d, lo, hi in edges] + [(a - 1, b - 1, -d, -hi, -lo) for a, b, d, lo, hi in edges]
-    table = np.array(sorted(rows))
-    receiver = table[:, 0].astype(np.int64)
-    return Links(
-        table[:, 1].astype(np.int64), receiver, np.searchsorted(receiver, np.arange(N + 1)), table[:, 2].copy(), table[:, 3].copy(),
-        table[:, 4].copy(), np.ones(len(table)), np.ones(len(table), bool), np.full(N, np.nan), np.arange(N),
-    )  # fmt: skip
-
-
-def scene(
-    edges: list[Edge], own: Floats = START, *, inputs: float = 11.0, period: float = T, held: int = 1, lead: float = 0.0,
-    time: float = 0.0,
-) -> Scene:  # fmt: skip
-    o, inf = np.zeros(N), np.full(N, np.inf)
-    return Scene(
-        trains=[str(i + 1) for i in range(N)],
-        consists=Consists(np.arange(N + 1), o, o + 1, o + 1, np.tile(DAVIS, (N, 1)), o, o, inf, inf, inf, inf, o),
-        own=own, links=links_of(edges), bounds=Bounds(*(np.full(N, b) for b in (75.0, 85.0, -inputs, inputs))),
-        reference=Reference(np.array([0.0, 2400.0]), np.array([[START[0, 0], V_R]])), time=time, step=period / held,
-        control_period=period, lead=lead, sub_step=period / held,
-    )  # fmt: skip
-
-
-class History(NamedTuple):
-    x: Floats  # (periods + 1, N) m
-    v: Floats  # m/s
-    u: Floats  # (periods, N) m/s2, the largest of the period by size
-    acted: list[set[str]]  # per period, which ends of (10) limited a move
-
-    def spacing(self, a: int, b: int) -> Floats:
-        return self.x[:, a - 1] - self.x[:, b - 1]
-
-    def beyond(self, edge: Edge, start: int, end: int) -> float:
-        """Largest amount beyond the edge's bounds in periods start..end [m]; negative inside."""
-        x = self.spacing(edge[0], edge[1])[start : end + 1]
-        return float(max(edge[3] - x.min(), x.max() - edge[4]))
-
-    def settled(self, edges: list[Edge], start: int, end: int, band: float = 1.0) -> int:
-        """Periods after ``start`` at which every edge is within ``band`` of its desired distance for good (until ``end``)."""
-        error = np.max([np.abs(self.spacing(a, b) - d) for a, b, d, _, _ in edges], axis=0)[start : end + 1]
-        return int(np.flatnonzero(error > band)[-1]) + 1 if (error > band).any() else 0
-
-
-def run(
-    before: list[Edge] = BEFORE, after: list[Edge] | None = None, *, periods: int = END, switch: int = SWITCH,
-    join: tuple[float, float] = (89000.0, 80.0), params: law.Params | None = None, inputs: float = 11.0, period: float = T,
-    held: int = 1, plant: str = "euler", lead: float | None = None, factor: Floats | None = None,
-) -> History:  # fmt: skip
-    """The example in closed loop; at ``switch`` train 5 is where ``join`` says and the edges are ``after``."""
-    theta = {"euler": point.lead(held), "exact": 0.5, "sumo": (1 + 1 / held) / 2}[plant]
-    sc = scene(before, inputs=inputs, period=period, held=held, lead=theta if lead is None else lead)
-    constants = law.constants(params or law.Params(), sc)
-    body = point.constants(point.Params(), sc.consists, factor)
-    own, links, kick = START.copy(), sc.links, point.Kick.none(N)
-    x, v, u, acted = [own[:, 0]], [own[:, 1]], [], []
-    for k in range(periods):
-        if after is not None and k == switch:
-            own[4], links = join, links_of(after)
-            x[-1], v[-1] = own[:, 0], own[:, 1]
-        leader = np.array([START[0, 0] + V_R * k * period, V_R, 0.0, 0.0])
-        trains = Trains(own[:, 0], own[:, 1], point.resistance(own[:, 1], body.davis))
-        sent = law.message(constants, trains, leader)
-        a = law.demand(constants, trains, leader, links, sent[links.sender]).acceleration
-        acted.append(limiting(sc, links, sent[:, 0], (own[:, 1] + a * period - V_R) * period))
-        largest = np.zeros(N)
-        for _ in range(held):
-            h = period / held
-            applied = a + point.resistance(own[:, 1], body.davis)
-            if plant == "euler":
-                own = point.advance(body, own, a, h, kick).own
-            else:
-                faster = own[:, 1] + a * h
-                own = np.column_stack((own[:, 0] + ((own[:, 1] + faster) / 2 if plant == "exact" else faster) * h, faster))
-            largest = np.where(np.abs(applied) > np.abs(largest), applied, largest)
-        x.append(own[:, 0])
-        v.append(own[:, 1])
-        u.append(largest)
-    return History(np.array(x), np.array(v), np.array(u), acted)
-
-
-def limiting(sc: Scene, links: Links, z: Floats, s: Floats) -> set[str]:
-    """Which of alpha, beta, eta of (10) equals the move s while the wanted move G is another."""
-    P, names = sc.control_period, set()
-    rho, Rho, mu, Mu = (b[0] for b in sc.bounds)
-    f, F = (DAVIS @ [1.0, w, w**2] for w in (rho, Rho))
-    common = {
-        "beta": ((rho - V_R) * P, (Rho - V_R) * P),
-        "eta": (Rho * P + (mu - f) * P**2 - V_R * P, rho * P + (Mu - F) * P**2 - V_R * P),
-    }
-    for i in range(N):
-        rows = slice(links.first[i], links.first[i + 1])
-        e = z[links.sender[rows]] - z[i]
-        if len(e) == 0 or abs(s[i] - np.mean(e - links.desired[rows]) / 2) < 1e-6:
-            continue
-        ends = {**common, "alpha": (np.max(e - links.upper[rows]) / 2, np.min(e - links.lower[rows]) / 2)}
-        names |= {name for name, pair in ends.items() if min(abs(s[i] - pair[0]), abs(s[i] - pair[1])) < 1e-6}
-    return names
 
 
 @pytest.fixture(scope="module", params=list(TOPOLOGIES))

@@ -5,134 +5,43 @@ Many cases at once are one scene of many formations without a link between them:
 
 from __future__ import annotations
 
-import itertools
-import json
-from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
 import pytest
 
+from trainctl.claims.robust_constrained import (
+    AMPLITUDE,
+    CYCLE,
+    FORMATION,
+    GRAPHS,
+    LINE,
+    PARAMS,
+    PRINTED,
+    SPACING,
+    START,
+    V0,
+    Edges,
+    H,
+    Kicks,
+    Loop,
+    N,
+    T,
+    both,
+    entries,
+    gain_of,
+    pairs_of,
+    printed,
+    quiet,
+    scene,
+    settle,
+    strongly_connected_digraphs,
+    theorem,
+)
 from trainctl.controllers import robust_constrained as law
 from trainctl.controllers import robust_gain, robust_theory
 from trainctl.plants import disturbance, point
-from trainctl.reference import constant
-from trainctl.signals import POSITION, SPEED, Bounds, Consists, Floats, Links, Scene, Trains
-
-T, V0, SPACING, N = 0.8, 80.0, 8000.0, 4
-START = np.array([27000.0, 18500.0, 7500.0, 0.0])
-FORMATION = 27000.0 - SPACING * np.arange(N)
-DAVIS = (1.176e-2, 7.7616e-4, 1.6e-5)
-PARAMS = law.Params(h_per_s=0.3)
-H = np.full(N, 0.3)
-
-Edges = Sequence[tuple[int, int]]  # (sender, receiver)
-
-
-def both(edges: Edges) -> Edges:
-    return [*edges, *((b, a) for a, b in edges)]
-
-
-LINE = both([(0, 1), (1, 2), (2, 3)])
-CYCLE = [(0, 1), (1, 2), (2, 3), (3, 0)]
-RING = both([(0, 1), (1, 2), (2, 3), (3, 0)])
-GRAPHS = {"line": LINE, "cycle": CYCLE, "ring": RING}
-
-#: Amplitudes of the example: w1 [m], w2 [m/s], w3 [m/s2], none of the resistance and the measurement.
-AMPLITUDE = np.zeros((5, N))
-AMPLITUDE[:3] = [[0.1] * 4, [0.1, 0.2, 0.1, 0.2], [0.01] * 4]
-PRINTED = [
-    {"on": "position", "shape": "constant", "amplitude_m": 0.1},
-    {"on": "speed", "shape": "constant", "amplitude_mps": [0.1, 0.2, 0.1, 0.2]},
-    {"on": "input", "shape": "constant", "amplitude_mps2": 0.01},
-]
-
-
-def entries(tables: list[dict[str, object]]) -> list[disturbance.Disturbance]:
-    return [disturbance.Disturbance.model_validate_json(json.dumps(t)) for t in tables]
-
-
-def scene(
-    graphs: Sequence[Edges], position: Floats, speed: Floats, *, n: int = N, weight: float = 0.01, steps: int = 1, period: float = T
-) -> Scene:
-    """One formation of ``n`` trains per graph."""
-    pairs = np.array([(n * g + s, n * g + r) for g, edges in enumerate(graphs) for s, r in edges]).reshape(-1, 2)
-    pairs = pairs[np.lexsort((pairs[:, 0], pairs[:, 1]))].astype(np.int64)
-    sender, receiver = np.ascontiguousarray(pairs[:, 0]), np.ascontiguousarray(pairs[:, 1])
-    m, links = n * len(graphs), len(pairs)
-    slot = np.tile(-SPACING * np.arange(n), len(graphs))
-    one, free = np.ones(m), np.full(m, np.inf)
-    return Scene(
-        trains=[str(i + 1) for i in range(m)],
-        consists=Consists(
-            np.arange(m + 1), 0 * one, 8e4 * one, one, np.tile(DAVIS, (m, 1)), 0 * one, 0 * one, free, free, free, free, 0 * one
-        ),
-        own=np.column_stack((np.tile(position, m // len(position)), np.tile(speed, m // len(speed)))).astype(float),
-        links=Links(
-            sender, receiver, np.searchsorted(receiver, np.arange(m + 1)), slot[sender] - slot[receiver],
-            np.full(links, -np.inf), np.full(links, np.inf), np.full(links, weight), np.ones(links, bool), slot, np.arange(m),
-        ),
-        bounds=Bounds(0 * one, 85.0 * one, -2.0 * one, 2.0 * one),
-        reference=constant(V0, 27000.0), time=0.0, step=period / steps, control_period=period, lead=point.lead(steps),
-        sub_step=period / steps,
-    )  # fmt: skip
-
-
-Kicks = Callable[[int, Floats], disturbance.Disturbed | None]
-
-
-def quiet(k: int, position: Floats) -> None:
-    return None
-
-
-def printed(k: int, position: Floats) -> disturbance.Disturbed:
-    return disturbance.at(SIGNALS, k, k * T, position)
-
-
-SIGNALS = disturbance.prepare(entries(PRINTED), ["1", "2", "3", "4"], T, None)
-
-
-class Loop:
-    """Law and plant, one step at a time, with fresh messages."""
-
-    def __init__(self, start: Scene, kicks: Kicks = quiet) -> None:
-        self.scene, self.kicks, self.k, self.own = start, kicks, 0, start.own.copy()
-        self.constants = law.constants(PARAMS, start)
-        clamps = point.Params(input_lower_mps2=-2.0, input_upper_mps2=2.0, speed_lower_mps=0.0, speed_upper_mps=85.0)
-        self.plant = point.constants(clamps, start.consists)
-        self.held = round(start.control_period / start.step)
-        self.moved: point.Moved | None = None
-
-    def step(self) -> point.Moved:
-        n, t = len(self.own), self.k * self.scene.step
-        d = self.kicks(self.k, self.own[:, POSITION])
-        plant = self.plant if d is None else self.plant._replace(resistance_factor=d.resistance)
-        kick = point.Kick.none(n) if d is None else point.Kick(d.position, d.speed, d.input)
-        if self.k % self.held == 0:
-            seen = self.own[:, POSITION] + (0.0 if d is None else d.measurement)
-            leader = np.array([27000.0 + V0 * t, V0, 0.0, 0.0])
-            trains = Trains(seen, self.own[:, SPEED], point.resistance(self.own[:, SPEED], self.plant.davis))
-            sent = law.message(self.constants, trains, leader)
-            self.demand = law.demand(self.constants, trains, leader, self.scene.links, sent[self.scene.links.sender])
-        self.moved = point.advance(plant, self.own, self.demand.acceleration, self.scene.step, kick)
-        self.own = self.moved.own
-        self.k += 1
-        return self.moved
-
-    def error(self, n: int = N) -> Floats:
-        """Position errors in the formation, less those of the first train of each: shape (copies, n)."""
-        p = (self.own[:, POSITION] - self.scene.links.slot).reshape(-1, n)
-        return p - p[:, :1]
-
-    def spread(self, n: int = N) -> Floats:
-        """Greatest |p_i - p_j - d_ij| of each formation."""
-        return np.ptp(self.error(n), axis=1)
-
-
-def pairs_of(error: Floats) -> Floats:
-    """p_i - p_j - d_ij of all pairs, shape (copies, 6), in the order of ``robust_gain.pair_rows``."""
-    return np.stack([error[:, i] - error[:, j] for i, j in itertools.combinations(range(N), 2)], axis=1)
-
+from trainctl.signals import POSITION, SPEED, Floats, Trains
 
 # --- the example -----------------------------------------------------------------------------------------------------------------
 
@@ -238,10 +147,6 @@ def test_lost_messages_are_kept_because_leaving_the_term_out_is_worse(drop: bool
 # --- the l1 bound ----------------------------------------------------------------------------------------------------------------
 
 
-def gain_of(graph: str, steps: int = 1) -> robust_gain.Gain:
-    return robust_gain.gain(H, scene([GRAPHS[graph]], START, np.zeros(N), steps=steps), AMPLITUDE)
-
-
 def test_l1_bounds_are_those_of_the_sheet() -> None:
     line = gain_of("line")
     by_pair = dict(zip(line.pairs, line.error_m, strict=True))
@@ -328,27 +233,6 @@ def test_many_random_signals_stay_below_the_bound(graph: str) -> None:
 # --- every graph -----------------------------------------------------------------------------------------------------------------
 
 
-def strongly_connected_digraphs() -> list[Edges]:
-    """All on 4 labelled nodes."""
-    every = [(a, b) for a in range(N) for b in range(N) if a != b]
-    chosen = (np.arange(2 ** len(every))[:, None] >> np.arange(len(every))) & 1
-    reach = np.tile(np.eye(N, dtype=np.int64), (len(chosen), 1, 1))
-    reach[:, [a for a, _ in every], [b for _, b in every]] = chosen
-    for _ in range(2):
-        reach = np.minimum(reach @ reach, 1)
-    return [[e for e, c in zip(every, row, strict=True) if c] for row in chosen[reach.all(axis=(1, 2))]]
-
-
-def settle(graphs: Sequence[Edges]) -> Floats:
-    """Time after which all errors stay below 1 mm, within 1000 s [s]; inf if they do not."""
-    loop = Loop(scene(graphs, START, np.zeros(N)))
-    last = np.zeros(len(graphs))
-    for _ in range(1250):
-        loop.step()
-        last[loop.spread() > 1e-3] = loop.k * T
-    return np.where(loop.spread() > 1e-3, np.inf, last)
-
-
 def test_a_sample_of_strongly_connected_graphs_settles() -> None:
     graphs = strongly_connected_digraphs()
     assert len(graphs) == 1606
@@ -365,10 +249,6 @@ def test_all_strongly_connected_graphs_settle() -> None:
 
 
 # --- the 7694 m of Theorem 1 -----------------------------------------------------------------------------------------------------
-
-
-def theorem(graph: Edges = LINE, speed: float = 0.0, weight: float = 0.01) -> robust_theory.Theorem:
-    return robust_theory.theorem_1(H, scene([graph], START, np.full(N, speed), weight=weight), AMPLITUDE[:3])
 
 
 def test_constants_of_the_example() -> None:

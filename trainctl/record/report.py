@@ -69,7 +69,7 @@ def page(run: Run) -> str:
     if not drawn.trains.names:
         raise InputError(f"{run.folder}: no train was recorded")
     values = run.metrics if (run.folder / "metrics.json").exists() else metrics(run)
-    data = {"animation": animation(drawn), "panels": panels(drawn), "title": drawn.known.title}
+    data: dict[str, Any] = {"animation": animation(drawn), "panels": panels(drawn), "title": drawn.known.title}
     parts = {
         "title": escape(drawn.known.title or run.folder.name),
         "css": _template("report.css"),
