@@ -165,11 +165,11 @@ def write(folder: Path, simulation: Simulation, more: Mapping[str, Any]) -> None
     simulation : Simulation
         Between two steps.
     more : mapping
-        Further plain JSON: what ``Recorder.cut`` and ``Tape.save`` returned.
+        Further plain JSON: ``identity``, what ``Recorder.cut`` and ``Tape.save`` returned.
     """
     values, whole = state(simulation)
     arrays = {name: array for part, value in whole.items() for name, array in leaves(part, value)}
-    text = json.dumps({**identity(simulation.p), **values, **more}).encode()
+    text = json.dumps({**values, **more}).encode()
     packed = io.BytesIO()
     np.savez(packed, allow_pickle=False, **arrays, json=np.frombuffer(text, np.uint8))
     replace(folder / STATE, packed.getvalue())

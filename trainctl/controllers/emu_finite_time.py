@@ -252,6 +252,12 @@ def watch(i: int, constants: Constants, leader: Floats, first: Ints, own: Floats
                 out[0] = s
 
 
+def watched_bounds(params: Params, scene: Scene) -> tuple[Floats, Floats]:
+    """Lower and upper bounds of what ``watch`` writes, each (n, 1): the clear distance stays above the emergency distance le."""
+    n = len(scene.trains)
+    return np.full((n, 1), params.emergency_distance_m), np.full((n, 1), np.inf)
+
+
 def violations(params: Params, scene: Scene) -> list[str]:
     """Say which hypotheses of Theorem 1, and which needs of the law, do not hold at the start."""
     found = [*broken_zones(params), *broken_trains(params, scene), *broken_links(params, scene)]

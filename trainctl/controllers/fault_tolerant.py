@@ -252,6 +252,14 @@ def watch(i: int, constants: Constants, leader: Floats, first: Ints, own: Floats
     out[2] = out[1] + constants.ell1 * out[0]
 
 
+def watched_bounds(params: Params, scene: Scene) -> tuple[Floats, Floats]:
+    """Lower and upper bounds of what ``watch`` writes, each (n, 3): R2, R3 and R3'."""
+    known = constants(params, scene)
+    speed = np.tile([params.speed_error_lower_mps, params.speed_error_upper_mps], (len(scene.trains), 1))
+    both = np.stack([known.distance[:, :2], speed, known.mixed[:, :2]], axis=1)
+    return both[:, :, 0].copy(), both[:, :, 1].copy()
+
+
 def inadmissible(params: Params, spacing_error: float, speed_error: float, lower: float, upper: float) -> list[str]:
     """Reasons why a train may not begin to follow another now: start condition (39). Empty: it may.
 

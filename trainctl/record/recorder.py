@@ -161,8 +161,18 @@ class Recorder:
         if self._events.closed:
             return
         self._events.close()
+        self._cut_all()
+
+    def _cut_all(self) -> None:
+        """Close the segments of all tables, also of those behind one whose segment did not fit on the disk."""
+        failed = None
         for table in self._tables.values():
-            table.cut()
+            try:
+                table.cut()
+            except OSError as error:
+                failed = failed or error
+        if failed is not None:
+            raise failed
 
     def close(self) -> None:
         """Write ``<table>.parquet`` from the segments and remove them. If the disk is full the segments stay readable.
@@ -172,8 +182,7 @@ class Recorder:
         if self._events.closed:
             return
         self._events.close()
-        for table in self._tables.values():
-            table.cut()
+        self._cut_all()
         for name, table in self._tables.items():
             table.join(self.folder / f"{name}.parquet")
         remove(self._segments)

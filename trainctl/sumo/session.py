@@ -7,6 +7,7 @@ The options below are not taste: each one switches off something of SUMO's that 
 from __future__ import annotations
 
 import math
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -238,6 +239,9 @@ class Sumo:
         if self.began:
             self.began = False
             self.api.close()
+            torn = [name for key, name in LOGS.items() if key != "log" and not _ended(self.folder / name)]
+            if torn:
+                raise SimulatorError(f"SUMO left {', '.join(torn)} incomplete without a word: is the disk full?")
 
     def messages(self) -> list[tuple[float | None, str]]:
         """Warnings and errors SUMO wrote, with the time it named, if any."""
@@ -261,3 +265,13 @@ class Sumo:
         except (self.api.TraCIException, self.api.FatalTraCIError) as error:
             where = f" at {self._time():.3f} s" if self.began and libsumo.simulation.isLoaded() else ""
             raise SimulatorError(f"SUMO{where}: {error}") from None
+
+
+def _ended(path: Path) -> bool:
+    """Whether a log has its end: SUMO does not tell when it could not write on."""
+    if not path.is_file() or path.stat().st_size < 4:
+        return False
+    with path.open("rb") as file:
+        file.seek(-min(path.stat().st_size, 200), os.SEEK_END)
+        end = file.read()
+    return end.endswith(b"PAR1") if path.suffix == ".parquet" else re.search(rb"(</[\w-]+>|/>)\s*$", end) is not None
