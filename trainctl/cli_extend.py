@@ -36,7 +36,9 @@ def new_controller(
 
 def export(
     folder: RunFolder,
-    form: Annotated[Literal["csv", "mat"], typer.Option("--format", help="csv: a file per table; mat: one file for MATLAB.")],
+    form: Annotated[
+        Literal["csv", "mat"], typer.Option("--format", help="csv: a file per table; mat: one file for MATLAB.")
+    ] = "csv",
     out: Annotated[
         Path | None, typer.Option(help="csv: folder, default RUN/export; mat: file, default RUN/export/RUN.mat.")
     ] = None,

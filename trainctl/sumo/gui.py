@@ -125,6 +125,10 @@ class Gui(Sumo):
     def linked(self, links: Links, formation: Ints) -> None:
         """Colour the trains by role and draw the links."""
         self.links = links
+        self._call(self._colour, links, formation)
+        self._call(self._draw)
+
+    def _colour(self, links: Links, formation: Ints) -> None:
         order = links.order
         leads = np.ones(len(order), bool)
         leads[1:] = formation[order[1:]] != formation[order[:-1]]
@@ -133,20 +137,25 @@ class Gui(Sumo):
         hears = np.diff(links.first) > 0
         for i, name in enumerate(self.ids):
             colour = ALONE if not hears[i] else FIRST if first[i] else MEMBER
-            self._call(traci.vehicle.setColor, name, colour)
-            self._call(traci.polygon.setColor, f"dot_{name}", colour)
+            traci.vehicle.setColor(name, colour)
+            traci.polygon.setColor(f"dot_{name}", colour)
         for arc in self.shown:
-            self._call(traci.polygon.remove, arc)
+            traci.polygon.remove(arc)
         self.shown = set()
-        self._draw()
 
     def move(self, displacement: Floats, step: float) -> None:
         """As in ``Sumo``; then the picture follows."""
+        self._call(super().move, displacement, step)
+        self._call(self._draw)
+
+    def _call(self, function: Any, *arguments: Any) -> Any:
+        """TraCI's own errors in the project's words."""
         try:
-            super().move(displacement, step)
-            self._draw()
+            return function(*arguments)
         except traci.FatalTraCIError:
-            raise SimulatorError("the window was closed before the end") from None
+            raise SimulatorError(f"{self.binary} is gone before the end: was its window closed?") from None
+        except traci.TraCIException as error:
+            raise SimulatorError(f"SUMO: {error}") from None
 
     def close(self) -> None:
         """End the simulation, whether the window is still there or not."""

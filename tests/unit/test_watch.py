@@ -1,0 +1,103 @@
+"""Watching over TraCI, with the program that has no window: the loop, the picture and the replay are the same."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trainctl.errors import InputError, SimulatorError
+from trainctl.prepare import open_scenario
+from trainctl.runner import run
+from trainctl.sumo import gui
+from trainctl.sumo.replay import replay
+
+BIN = Path(sys.executable).parent / "trainctl"
+
+#: Train 1 takes the crossover to track 3 at 25 km in the 8th second.
+REROUTED = """extends = "three_tracks"
+[run]
+duration_s = 16
+[[event]]
+kind = "reroute"
+train = 1
+to_track = 3
+"""
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    (tmp_path / "s.toml").write_text(REROUTED)
+    return open_scenario(str(tmp_path / "s.toml"))
+
+
+def test_a_watched_run_is_the_same_run(scenario, tmp_path, monkeypatch):
+    colours, arcs = {}, []
+    add, colour = gui.traci.polygon.add, gui.traci.vehicle.setColor
+    monkeypatch.setattr(gui.traci.polygon, "add", lambda name, *a, **k: (arcs.append(name), add(name, *a, **k)))
+    monkeypatch.setattr(gui.traci.vehicle, "setColor", lambda name, c: (colours.setdefault(name, []).append(c), colour(name, c)))
+    watched = run(scenario, tmp_path / "watched", gui="sumo")
+    plain = run(scenario, tmp_path / "plain")
+    for name in ("trains", "units", "links"):
+        assert (watched.folder / f"{name}.parquet").read_bytes() == (plain.folder / f"{name}.parquet").read_bytes()
+    # train 1 leads until it leaves; then train 2 does
+    assert (colours["1"][0], colours["1"][-1]) == (gui.FIRST, gui.ALONE)
+    assert (colours["2"][0], colours["2"][-1]) == (gui.MEMBER, gui.FIRST)
+    assert colours["5"][0] == gui.ALONE
+    links = [a for a in arcs if a.startswith("link_")]
+    assert {"link_1_2", "link_2_1", "link_4_6"} <= set(links)
+    assert links.count("link_2_3") == 2  # drawn again when the links changed
+    picture = ET.parse(watched.folder / "sumo" / "picture.add.xml").getroot()
+    assert {"track_1", "track_2", "track_3", "crossover_leave"} <= {p.get("id") for p in picture}
+
+
+def test_a_run_is_shown_again(scenario, tmp_path, monkeypatch):
+    seen = []
+    read = gui.Gui.move
+    monkeypatch.setattr(gui.Gui, "move", lambda self, *a: (read(self, *a), seen.append(self.seen.position.copy())))
+    for backend in ("sumo", "numeric"):
+        seen.clear()
+        done = run(scenario, tmp_path / backend, backend)
+        assert replay(done, "sumo", from_s=2.0, delay_ms=0.0) == 14
+        wanted = done.trains.pivot(index="time_s", columns="train", values="position_m").loc[3.0:].to_numpy()
+        np.testing.assert_allclose(seen, wanted, atol=1e-6)
+
+
+def test_a_run_recorded_seldom_is_shown_too(tmp_path):
+    done = run(open_scenario("three_tracks", {"run.duration_s": 120, "run.record_every_s": 50}), tmp_path / "r", "numeric")
+    assert replay(done, "sumo") == 2  # 0, 50, 100; the last row, at 120 s, is out of step
+    with pytest.raises(InputError, match="fewer than two"):
+        replay(done, "sumo", from_s=101.0)
+
+
+def test_without_a_display_or_program_it_is_one_line(scenario, tmp_path, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(InputError, match="no display"):
+        run(scenario, tmp_path / "r", gui="sumo-gui")
+    with pytest.raises(InputError, match="no such program"):
+        run(scenario, tmp_path / "r", gui="no-such-sumo")
+    assert not list(tmp_path.glob("r*"))
+
+
+def test_a_window_that_is_closed_ends_the_run(scenario, tmp_path, monkeypatch):
+    def closed(self):
+        raise gui.traci.FatalTraCIError("connection closed")
+
+    monkeypatch.setattr(gui.Gui, "_draw", closed)
+    with pytest.raises(SimulatorError, match="was its window closed"):
+        run(scenario, tmp_path / "r", gui="sumo")
+    assert (tmp_path / "r.partial" / "run.json").is_file()
+    monkeypatch.undo()
+    assert run(scenario, tmp_path / "r", gui="sumo").info["status"] == "complete"  # the next one starts
+
+
+def test_from_the_command_line(tmp_path):
+    watch = [BIN, "run", "fully_distributed", "--gui", "--gui-program", "sumo", "--set", "run.duration_s=5", "-q", "--out", "r"]
+    subprocess.run(watch, cwd=tmp_path, check=True)
+    done = subprocess.run([BIN, "replay", "r", "--gui-program", "sumo"], cwd=tmp_path, check=True, capture_output=True, text=True)
+    assert done.stdout.strip() == "5 steps shown"
