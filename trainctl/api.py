@@ -118,10 +118,10 @@ class Plots:
         self._run = run
 
     def __dir__(self) -> list[str]:
-        from trainctl.record import figures, style
+        from trainctl.record import figures, figures_trains, style
 
         with style.styled():
-            return sorted(figures.applicable(figures.prepare(self._run, "double")))
+            return sorted(figures.applicable(figures_trains.prepare(self._run, "double")))
 
     def __getattr__(self, name: str) -> Callable[..., Figure]:
         from trainctl.record import figures

@@ -7,6 +7,7 @@ their neighbours, with one link more and one train that hears nobody; the refere
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -88,8 +89,8 @@ def check_repeatable_and_inputs_untouched(x: Example) -> None:
     own, hearing = disturbed(), links(x)
     constants = x.law.constants(x.params, scene(x, own))
     sent = heard(x, constants, own, hearing)
-    arguments = (trains(own), LEADER, hearing, sent)
-    copies = tuple(type(a)(*(y.copy() for y in a)) if isinstance(a, tuple) else a.copy() for a in arguments)
+    arguments: tuple[Any, ...] = (trains(own), LEADER, hearing, sent)
+    copies = deepcopy(arguments)
     first = x.law.demand(constants, *arguments)
     second = x.law.demand(constants, *arguments)
     for one, two in zip(first, second, strict=True):

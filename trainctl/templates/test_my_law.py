@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -23,6 +24,7 @@ def test_contract(check: Callable[[Example], None]) -> None:
 
 def test_it_runs_on_three_tracks(tmp_path: Path) -> None:
     """The first ten control periods keep every bound."""
-    run = trainctl.run(HERE / "my_law.toml", backend="numeric", out=tmp_path / "run", **{"run.duration_s": 80})
+    settings: dict[str, Any] = {"run.duration_s": 80}
+    run = trainctl.run(HERE / "my_law.toml", backend="numeric", out=tmp_path / "run", **settings)
     assert run.info["status"] == "complete"
     assert run.metrics["bounds.broken"] == 0
