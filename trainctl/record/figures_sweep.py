@@ -25,6 +25,9 @@ SHOWN = {
     "formation.final_error_m": "spacing error\nat the end [m]",
 }
 
+#: Values that differ by less are one value, and no axis is stretched over it.
+ROUNDING = 1e-6
+
 
 def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
     """Draw the complete runs over the first setting that is a number and varies, or else in order of size; broken bounds in red.
@@ -43,7 +46,7 @@ def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
     axis = next((k for k in parameters if k != "run.seed" and done[k].dtype.kind in "if" and done[k].nunique() > 1), None)
     broken = done["violations"].to_numpy(float) > 0
     with style.styled():
-        figure, axes = style.panels(max(1, len(shown)), "double", 26.0)
+        figure, axes = style.panels(max(1, len(shown)), "double", 34.0)
         for panel, key in zip(axes, shown, strict=False):
             value = done[key].to_numpy(float)
             if axis is None:
@@ -54,8 +57,12 @@ def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
                 places = np.unique(at)
                 middle = [np.nanmedian(value[at == x]) if np.isfinite(value[at == x]).any() else np.nan for x in places]
                 panel.plot(places, middle, color=style.GREY, label="median")
-            panel.plot(at[~red], value[~red], ".", markersize=3, color=style.COLOURS[0], label="all bounds held")
-            panel.plot(at[red], value[red], ".", markersize=3, color=style.COLOURS[1], label="a bound broken")
+            for chosen, colour, label in ((~red, 0, "all bounds held"), (red, 1, "a bound broken")):
+                if chosen.any():
+                    panel.plot(at[chosen], value[chosen], ".", markersize=3, color=style.COLOURS[colour], label=label)
+            least, most = np.nanmin(value), np.nanmax(value)
+            if most - least < ROUNDING:
+                panel.set_ylim(least - 1.0, most + 1.0)
             if key.startswith("bounds."):
                 panel.axhline(0.0, color="black", linestyle="--", linewidth=0.6)
             panel.set_ylabel(SHOWN[key])
