@@ -83,7 +83,11 @@ class Tape:
         # unbuffered: what did not fit on the disk must not come back when the file is closed
         self.file = open(self.path, "r+b" if saved else "wb", buffering=0)  # noqa: SIM115  closed by close()
         if saved:
-            self._rewind(8 * self.steps * self.trains)
+            try:
+                self._rewind(8 * self.steps * self.trains)
+            except InputError:
+                self.file.close()
+                raise
 
     def _rewind(self, size: int) -> None:
         crc, left = 0, size
@@ -203,7 +207,7 @@ def read(folder: Path, p: Prepared) -> Saved | None:
     if not path.exists():
         return None
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as whole, np.load(whole, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         values = json.loads(bytes(arrays.pop("json")))
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:

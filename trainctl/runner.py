@@ -221,16 +221,14 @@ def _driven(
             _quietly(world.close)
         if journal is not None:
             _quietly(journal.leave if tape is not None else journal.close)
-        if isinstance(error, InputError):
+        if isinstance(error, InputError) and saved is None:
             remove(partial)
         else:
             remove(place / checkpoint.RESERVE)
             failure = {"reason": str(error) or type(error).__name__, "time_s": simulation.time if simulation is not None else 0.0}
             status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
             steps = simulation.k if simulation is not None else 0
-            _quietly(
-                write_info, partial, {**info, "status": status, "steps": steps, "wall_time_s": elapsed(), "failure": failure}
-            )
+            _quietly(write_info, partial, {**info, "status": status, "steps": steps, "wall_time_s": elapsed(), "failure": failure})
         raise
 
 

@@ -112,9 +112,7 @@ class Alarms:
             ("spacing_upper_m", links.upper, spacing > links.upper + ROUNDING),
         ):
             for k in np.flatnonzero(broken & ahead).tolist():
-                yield from self._once(
-                    key, f"{ids[links.sender[k]]}-{ids[links.receiver[k]]}", float(spacing[k]), float(bound[k])
-                )
+                yield from self._once(key, f"{ids[links.sender[k]]}-{ids[links.receiver[k]]}", float(spacing[k]), float(bound[k]))
 
     def _couplers(self, row: Row) -> Iterator[Alarm]:
         """Couplers beyond their range in any sub-step since the last row."""

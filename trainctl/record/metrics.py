@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from trainctl.errors import InputError
 from trainctl.record import motion, traffic
 from trainctl.record.facts import UNBOUNDED, Facts, facts, leader
 from trainctl.record.run import Run
@@ -99,7 +100,12 @@ def metrics(run: Run, *, band_m: float = 1.0, speed_band: float = 0.02, section_
     values |= motion.of_energy(trains, units, known)
     values |= motion.of_comfort(trains)
     values |= traffic.of_trains(trains, section_m)
-    values |= traffic.of_sumo(run.folder / "sumo")
+    try:
+        values |= traffic.of_sumo(run.folder / "sumo")
+    except InputError:
+        if run.info.get("status") == "complete":
+            raise
+        # a killed simulator leaves its logs torn
     return values
 
 
