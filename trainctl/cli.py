@@ -381,7 +381,13 @@ def main() -> None:
     """Entry point: every error of ours is one line per mistake and an exit code, never a traceback."""
     try:
         code = app(standalone_mode=False)
+        if code == 130:  # the command line parser has swallowed the interrupt
+            _tell(["trainctl: interrupted"])
         sys.exit(code if isinstance(code, int) else 0)
+    except SystemExit as end:
+        if isinstance(end.__context__, BrokenPipeError):  # which the parser turns into 1
+            sys.exit(3)
+        raise
     except InputError as error:
         _tell(error.mistakes)
         sys.exit(error.exit_code)
