@@ -33,7 +33,9 @@ def register(app: typer.Typer) -> None:
         ] = None,
         out: Annotated[Path | None, typer.Option(help="Folder of the sweep; default sweeps/NAME.")] = None,
         workers: Annotated[int | None, typer.Option(min=1, help="Processes on this machine; default one per core.")] = None,
-        scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A running Dask scheduler instead.")] = None,
+        scheduler: Annotated[
+            str | None, typer.Option(metavar="ADDRESS", help="A running Dask scheduler instead: tcp://..., or its .json file.")
+        ] = None,
         backend: Annotated[Literal["sumo", "numeric"], typer.Option(help="SUMO, or the same loop without a simulator.")] = "sumo",
         resume: Annotated[bool, typer.Option("--resume", help="Go on with the sweep in --out; what is done stays.")] = False,
         force: Annotated[bool, typer.Option("--force", help="Replace whatever lies at --out.")] = False,

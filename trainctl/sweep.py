@@ -292,7 +292,7 @@ def sweep(
     workers : int, optional
         Processes of the local cluster; default one per core.
     scheduler : str, optional
-        Address of a running Dask scheduler, instead of a local cluster.
+        Address of a running Dask scheduler, or the .json file it wrote (``--scheduler-file``), instead of a local cluster.
     resume : bool
         Go on with the sweep in ``out``: only runs that are not there yet, or failed, are done.
     force : bool
@@ -399,7 +399,8 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
     ):
         if scheduler is not None:
             try:
-                client = Client(scheduler, timeout=10, set_as_default=False)  # type: ignore[no-untyped-call]
+                where = {"scheduler_file": scheduler} if scheduler.endswith(".json") else {"address": scheduler}
+                client = Client(**where, timeout=10, set_as_default=False)  # type: ignore[no-untyped-call]
             except (OSError, ValueError, TypeError) as error:
                 raise InputError(f"--scheduler {scheduler}: no Dask scheduler answers there: {error}") from None
             with client:

@@ -75,8 +75,7 @@ def test_a_separate_scheduler_gives_the_dataset_of_the_local_cluster(alone, tmp_
         deadline = time.monotonic() + 60
         while not address.exists() and time.monotonic() < deadline:
             time.sleep(0.1)
-        where = json.loads(address.read_text())["address"]
-        done = subprocess.run(command(tmp_path / "far", "--scheduler", where, "-q"), capture_output=True, text=True, check=False)
+        done = subprocess.run(command(tmp_path / "far", "--scheduler", address, "-q"), capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
     finally:
         for process in reversed(started):
