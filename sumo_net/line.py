@@ -235,7 +235,7 @@ def _rail_edges(path: Path) -> list[_NetEdge]:
         raise LineError([f"{path}: no such net file"]) from None
     except OSError as error:
         raise LineError([f"{path}: cannot be read: {error.strerror}"]) from None
-    except expat.ExpatError as error:
+    except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: an encoding that is none
         raise LineError([f"{path}: not XML: {error}"]) from None
     if not found:
         raise LineError([f"{path}: has no rail edges"])

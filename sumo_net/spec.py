@@ -33,7 +33,8 @@ class LineError(Exception):
     """A line description or a net file is wrong. ``mistakes`` has one line each: ``file: key = value: rule``."""
 
     def __init__(self, mistakes: Sequence[str]) -> None:
-        self.mistakes = list(mistakes)
+        # One line each: what a file says is escaped.
+        self.mistakes = ["".join(c if c.isprintable() else repr(c)[1:-1] for c in line) for line in mistakes]
         super().__init__("\n".join(self.mistakes))
 
 

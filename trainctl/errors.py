@@ -5,6 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 
+def printable(line: str) -> str:
+    """One line that a terminal shows as it is: what a file may say is escaped."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in line)
+
+
 class TrainctlError(Exception):
     """Base of all errors this package raises on purpose."""
 
@@ -17,7 +22,7 @@ class InputError(TrainctlError):
     exit_code = 2
 
     def __init__(self, mistakes: Sequence[str] | str) -> None:
-        self.mistakes = [mistakes] if isinstance(mistakes, str) else list(mistakes)
+        self.mistakes = [printable(line) for line in ([mistakes] if isinstance(mistakes, str) else mistakes)]
         super().__init__("\n".join(self.mistakes))
 
 

@@ -52,7 +52,7 @@ class Report:
         if not found:
             return None
         table, time, who, column = min(found, key=lambda item: item[1])
-        where = ", ".join(part for part in ("" if time == -math.inf else f"{time:.10g} s", who) if part)
+        where = ", ".join(part for part in ("" if time == math.inf else f"{time:.10g} s", who) if part)
         text = f"{table}: {where}" if where else table
         return text if column is None or column.first is None else f"{text}: {column.column} {told(column.first)}"
 

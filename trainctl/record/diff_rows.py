@@ -73,14 +73,14 @@ class TableDiff:
 
     @property
     def first(self) -> tuple[float, str, ColumnDiff | None] | None:
-        """Time, description and column of the first difference."""
+        """Time (infinite in a log without times), description and column of the first difference."""
         found: list[tuple[float, str, ColumnDiff | None]] = []
         for c in self.columns.values():
             if c.first is not None:
-                found.append((-math.inf if c.first.time_s is None else c.first.time_s, c.first.who, c))
+                found.append((math.inf if c.first.time_s is None else c.first.time_s, c.first.who, c))
         for rows, words in ((self.missing, "row only in A"), (self.extra, "row only in B")):
             if rows.count:
-                time = -math.inf if rows.first_time_s is None else rows.first_time_s
+                time = math.inf if rows.first_time_s is None else rows.first_time_s
                 found.append((time, f"{rows.first_who}: {words}".removeprefix(": "), None))
         return min(found, key=lambda item: item[0], default=None)
 
@@ -376,7 +376,7 @@ def _repeats(keys: Ints) -> Ints:
 def _number(value: Any, difference: float | None) -> Any:
     if difference is None or value is None:
         return value
-    return float(value)
+    return None if value == "" else float(value)
 
 
 def _floats(column: pa.ChunkedArray) -> Floats | None:

@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 
 from trainctl.errors import InputError
 from trainctl.record.folder import FORMAT, INFO, SCHEMA_VERSION
+from trainctl.record.run_schema import check_table
 
 
 class Run:
@@ -133,9 +134,11 @@ class Run:
                 except (pa.ArrowException, OSError) as error:
                     raise InputError(f"{path}: damaged: {_first_line(error)}") from None
         try:
-            whole: pd.DataFrame = pa.concat_tables(parts).unify_dictionaries().to_pandas()
+            joined = pa.concat_tables(parts).unify_dictionaries()
         except pa.ArrowException as error:
             raise InputError(f"{self.folder}: segments of {table} do not fit together: {_first_line(error)}") from None
+        check_table(table, joined, self.folder)
+        whole: pd.DataFrame = joined.to_pandas()
         return whole
 
 

@@ -211,7 +211,10 @@ def _fcd_csv(path: Path) -> Iterator[pd.DataFrame]:
 def _fcd_parquet(path: Path) -> Iterator[pd.DataFrame]:
     try:
         with pq.ParquetFile(path) as file:
-            names = _columns(path, set(file.schema_arrow.names))
+            known = file.schema_arrow.names
+            names = _columns(path, set(known))
+            if any(known.count(theirs) > 1 for theirs in names.values()):
+                raise InputError(f"{path}: not an FCD log: a column stands more than once")
             for batch in file.iter_batches(batch_size=BATCH_ROWS, columns=list(names.values())):
                 piece = batch.to_pandas().rename(columns={file: ours for ours, file in names.items()})
                 piece = piece[piece["id"].notna()].copy()  # a step without vehicles is a row without a vehicle

@@ -1,0 +1,34 @@
+"""Every shipped scenario gives the run it gave when its golden was kept: `python tools/update_golden.py` renews them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from trainctl.record.diff import read_tolerances
+from trainctl.scenario import shipped
+from trainctl.testing import assert_run_matches
+
+GOLDENS = Path(__file__).parent / "goldens"
+TOLERANCES = read_tolerances(GOLDENS / "tolerances.toml")
+
+
+@pytest.mark.parametrize("name", sorted(shipped()))
+def test_run_matches_its_golden(finished, name):
+    report = assert_run_matches(finished(name), GOLDENS / name, TOLERANCES)
+    rows = {t.table: t.rows for t in report.tables}
+    assert min(rows[table] for table in ("trains", "fcd", "tripinfo", "statistics", "vehroute", "events")) > 0
+    assert rows["trains"] >= 40, "a golden that holds next to nothing proves nothing"
+
+
+def test_goldens_are_small_and_none_is_stale():
+    assert {p.name for p in GOLDENS.iterdir() if p.is_dir()} == set(shipped())
+    assert sum(p.stat().st_size for p in GOLDENS.rglob("*") if p.is_file()) < 2_000_000
+
+
+def test_a_golden_does_not_match_another_run(finished):
+    """The ratchet run starts otherwise than the paper's."""
+    with pytest.raises(AssertionError, match="first: trains: ") as told:
+        assert_run_matches(finished("fully_distributed_ratchet"), GOLDENS / "fully_distributed", TOLERANCES)
+    assert "scenario." in str(told.value)
