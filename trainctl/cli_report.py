@@ -68,7 +68,7 @@ def compare(
     if as_json:
         _print_json({"runs": labels, "rows": rows, "left_out": left_out, "figures": figures})
         return
-    table = _table(None, "metric", *labels, "unit")
+    table = _table(None, "metric", *(label.replace("_", " ") for label in labels), "unit")
     for row in rows:
         table.add_row(row["metric"], *(_shown(value) for value in row["values"]), row["unit"])
     _print(table)

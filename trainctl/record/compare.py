@@ -1,7 +1,7 @@
 """Several runs side by side: one table, and figures with one panel per run on common axes.
 
-``alternatives`` puts the other laws in front of the same traffic: trains, network, events, reference, bounds and links stay, the law
-and what belongs to it (plant, observer, periods) changes.
+``alternatives`` puts the other laws in front of the same traffic: trains, network, events, reference, bounds and links stay, the
+law and what belongs to it (plant, observer, periods) changes.
 """
 
 from __future__ import annotations
@@ -86,11 +86,14 @@ def side_by_side(drawn: Sequence[Drawn], labels: Sequence[str], paint: Callable[
     figure = Figure(figsize=(style.WIDTHS_MM["double"] * millimetre, (down * 48.0 + 14.0) * millimetre), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
-    for axes, one, label in zip(grid.flat, drawn, labels, strict=False):
+    for k, (axes, one, label) in enumerate(zip(grid.flat, drawn, labels, strict=False)):
         paint(axes, one)
-        axes.set_title(label, loc="left")
-        axes.set_xlabel("time [s]")
-        axes.label_outer()
+        axes.set_title(label.replace("_", " "), loc="left")
+        if k % across:
+            axes.set_ylabel("")
+        if k + across >= len(drawn):  # the lowest of its column
+            axes.set_xlabel("time [s]")
+            axes.tick_params(labelbottom=True)
     for axes in list(grid.flat)[len(drawn) :]:
         axes.remove()
     style.legend(figure, "double")
@@ -116,12 +119,14 @@ def _errors(axes: Axes, drawn: Drawn) -> None:
 
 
 PANELS: dict[str, Callable[[Axes, Drawn], None]] = {
-    "positions": _relative, "spacing_errors": _errors, "speeds": lambda a, d: draw_speeds(a, d), "inputs": lambda a, d: draw_inputs(a, d),
+    "positions": _relative, "spacing_errors": _errors, "speeds": draw_speeds, "inputs": draw_inputs,
 }  # fmt: skip
 
 
-# --- the other laws on the same traffic -----------------------------------------------------------------------------------------------
+# --- the other laws on the same traffic -------------------------------------------------------------------------------------------
 
+#: Bounds that the point plant can clamp at.
+CLAMPS = ("speed_lower_mps", "speed_upper_mps", "input_lower_mps2", "input_upper_mps2")
 #: Laws of a comparison, in order; ``sumo`` only where there is such a controller.
 LAWS = ("fully_distributed", "robust_constrained", "emu_finite_time", "ordinary_consensus", "fault_tolerant", "sumo")
 
@@ -139,17 +144,16 @@ def alternatives(data: Mapping[str, Any], known: Sequence[str]) -> dict[str, dic
     Returns
     -------
     dict
-        Name of the law -> tables of its scenario. Keys of the laws' own that have a counterpart in the scenario's bounds are derived from
-        it; all others are the law's defaults (the paper's).
+        Name of the law -> tables of its scenario. Keys of the laws' own that have a counterpart in the scenario's bounds are
+        derived from it; all others are the law's defaults (the paper's).
     """
     found: dict[str, dict[str, Any]] = {}
     for name in LAWS:
         law = "emu_finite_time" if name == "ordinary_consensus" else name
         if law not in known:
             continue
-        own = data["controller"]["law"] == law and (float(data["controller"].get("alpha_1", 0.9)) == 1.0) == (
-            name == "ordinary_consensus"
-        )
+        ordinary = float(data["controller"].get("alpha_1", 0.9)) == 1.0
+        own = data["controller"]["law"] == law and ordinary == (name == "ordinary_consensus")
         found[name] = dict(data) if own else _under(name, law, data)
     return found
 
@@ -168,16 +172,15 @@ def _under(name: str, law: str, data: Mapping[str, Any]) -> dict[str, Any]:
         controller["h_per_s"] = 0.3
         topology["weight"] = 0.01
         run["control_period_s"] = run["step_s"] * max(1.0, round(1.0 / run["step_s"]))
+        if point:  # its model clamps speed and input
+            changed["plant"] = {**data["plant"], **{key: value for key, value in data.get("bounds", {}).items() if key in CLAMPS}}
     elif law == "emu_finite_time":
         controller |= _clear_distances(data) | {"alpha_1": 1.0 if name == "ordinary_consensus" else 0.9}
         run["sub_step_s"] = 0.0025 if name == "ordinary_consensus" else 0.01
     elif law == "fault_tolerant":
         error = max((abs(value) for value in _errors_allowed(data)), default=2351.0)
-        controller |= {
-            "leader_error_lower_m": -error,
-            "leader_error_upper_m": error,
-            "head_l1_per_s": min(0.01, 0.5 * 50.0 / error),
-        }
+        far = 2.0 * error  # of a train that follows the reference from another train's slot
+        controller |= {"leader_error_lower_m": -far, "leader_error_upper_m": far, "head_l1_per_s": min(0.01, 0.5 * 50.0 / far)}
         changed["plant"] = {"kind": "actuated_units"}
         changed["observer"] = {"kind": "asymptotic"}
         changed["train_type"] = {key: {"actuator_rate_per_s": 50.0, **kind} for key, kind in data.get("train_type", {}).items()}

@@ -16,6 +16,9 @@ from trainctl.record.figures_trains import Drawn
 from trainctl.record.values import at_least, at_most
 from trainctl.signals import Floats
 
+#: Stretch of time of a magnified panel [s].
+ZOOM_S = 60.0
+
 
 def couplers(drawn: Drawn) -> Figure:
     """Coupler displacements: shaded from least to greatest over the sub-steps, with the allowed range."""
@@ -48,6 +51,7 @@ def unit_forces(drawn: Drawn) -> Figure:
     if len(limits) <= 4:
         style.bound(axes[0], *(limit / 1000 for limit in limits), label="limit")
     axes[0].set_ylabel("unit force [kN]")
+    style.focus(axes[0], drawn.units.column("time_s"), low / 1000, high / 1000)
     return _finished(figure, axes, drawn)
 
 
@@ -109,20 +113,37 @@ def estimates(quantity: str, label: str) -> Callable[[Drawn], Figure]:
     estimate = {"fault": "fault_estimate_mps3", "acceleration": "acceleration_estimate_mps2"}[quantity]
 
     def figure_of(drawn: Drawn) -> Figure:
-        figure, axes = style.panels(2, drawn.width)
+        figure, axes = style.panels(3, drawn.width, 36.0, sharex=False)
         time = drawn.units.column("time_s")
         true, guess = drawn.units.column(truth), drawn.units.column(estimate)
         name, rows = drawn.units.slices()[0]
-        style.draw(axes[0], time[rows], true[rows], color=style.COLOURS[0], label=f"truth, unit {name}")
-        options = {"color": style.COLOURS[1], "linestyle": (0, (4, 1.5)), "label": f"estimate, unit {name}"}
-        style.draw(axes[0], time[rows], guess[rows], **options)
-        axes[0].set_ylabel(label)
-        _bands(axes[1], drawn, guess - true, guess - true, guess - true, "unit ")
-        axes[1].set_ylabel("error [" + label.partition("[")[2])
+        options: dict[str, Any] = {"color": style.COLOURS[1], "linestyle": (0, (4, 1.5)), "label": f"estimate, unit {name}"}
+        for panel in axes[:2]:
+            style.draw(panel, time[rows], true[rows], color=style.COLOURS[0], linewidth=1.6, label=f"truth, unit {name}")
+            style.draw(panel, time[rows], guess[rows], **options)
+            panel.set_ylabel(label)
+        begin = _worst_after_start(time[rows], guess[rows] - true[rows]) - ZOOM_S / 3
+        inside = (time[rows] >= begin) & (time[rows] <= begin + ZOOM_S)
+        both = np.concatenate([true[rows][inside], guess[rows][inside]])
+        axes[1].set_xlim(begin, begin + ZOOM_S)
+        if np.isfinite(both).any():
+            spare = 0.1 * float(np.ptp(both[np.isfinite(both)])) + 1e-9
+            axes[1].set_ylim(np.nanmin(both) - spare, np.nanmax(both) + spare)
+        axes[1].set_title("where that estimate is worst after the start", loc="right", fontsize=7)
+        _bands(axes[2], drawn, guess - true, guess - true, guess - true, "unit ")
+        axes[2].set_ylabel("error [" + label.partition("[")[2])
+        style.focus(axes[2], time, guess - true, guess - true)
+        axes[0].set_xlim(drawn.instants[0], drawn.instants[-1])
         return _finished(figure, axes, drawn)
 
     figure_of.__doc__ = f"True {quantity} and its estimate of one unit; error of the estimate of all units."
     return figure_of
+
+
+def _worst_after_start(time: Floats, error: Floats) -> float:
+    """When the error is largest, the first 20 s left out [s]."""
+    size = np.where(np.isfinite(error) & (time > time[0] + 20.0), np.abs(error), -1.0)
+    return float(time[int(np.argmax(size))])
 
 
 def _bands(panel: Axes, drawn: Drawn, value: Floats, low: Floats, high: Floats, what: str) -> None:
@@ -186,6 +207,7 @@ def _between_units(panel: Axes, drawn: Drawn, column: str) -> None:
         if name.rpartition(".")[0] == after.rpartition(".")[0] and rows.stop - rows.start == behind.stop - behind.start:
             difference[rows] = value[rows] - value[behind]
     _bands(panel, drawn, difference, difference, difference, "unit ")
+    style.focus(panel, drawn.units.column("time_s"), difference, difference)
 
 
 def _finished(figure: Figure, axes: list[Axes], drawn: Drawn) -> Figure:

@@ -1,4 +1,4 @@
-"""One page per run, ``report.html``: verdicts, an animation of the tracks and linked plots. It opens offline: nothing is fetched."""
+"""One page per run, ``report.html``: verdicts, an animation of the tracks and linked plots. It opens offline."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ BOUNDS = {
 
 #: What else the summary names.
 FIGURES = (
-    "formation.settling_s", "formation.final_error_m", "formation.final_speed_error_mps", "traffic.gap_min_m", "traffic.headway_min_s",
+    "formation.settling_s", "formation.final_error_m", "formation.final_speed_error_mps", "traffic.gap_min_m",
+    "traffic.headway_min_s",
     "traffic.trains_per_hour", "energy.traction_kwh", "energy.net_kwh_per_train_km", "comfort.jerk_max_mps3", "string.l2_gain",
     "traffic.collisions", "traffic.teleports",
 )  # fmt: skip
@@ -169,7 +170,8 @@ def _figures(values: Mapping[str, Any]) -> str:
             value, (unit, words) = values[name], DEFINITIONS.get(name, ("", ""))
             shown = "never" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
             rows.append(
-                f'<tr><th scope=row title="{escape(words)}">{escape(name)}</th><td class=n>{escape(shown)}</td><td>{escape(unit)}</td></tr>'
+                f'<tr><th scope=row title="{escape(words)}">{escape(name)}</th>'
+                f"<td class=n>{escape(shown)}</td><td>{escape(unit)}</td></tr>"
             )
     return "".join(rows)
 

@@ -16,7 +16,7 @@ from trainctl.record.series import INSTANT
 from trainctl.signals import Floats
 
 #: Frames at most, and trains times frames at most.
-FRAMES, CELLS = 2500, 250_000
+FRAMES, CELLS = 2500, 150_000
 #: Minimum number of frames, however many trains.
 FEWEST = 300
 #: Events named in the page.

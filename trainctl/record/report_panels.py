@@ -26,7 +26,7 @@ Trace = dict[str, Any]
 #: Points of one panel at most, shared by its lines: a browser draws that many without a stutter.
 POINTS_PER_PANEL = 40_000
 #: Points of one line: at most, and at least however many lines there are.
-POINTS = (2000, 200)
+POINTS = (2000, 120)
 #: Dashes of the library per track, in lateral order, as ``style.TRACK_STYLES``.
 DASHES = ("solid", "8px,3px", "2px,3px", "8px,3px,2px,3px")
 #: More different bounds than this in one panel are not drawn.
@@ -86,7 +86,7 @@ def _train_graph(drawn: Drawn) -> Iterator[Panel]:
     reference = drawn.known.reference
     kinds = [("graph", "Train graph", "position [km]")]
     if reference is not None:
-        kinds.append(("relative", "Position relative to the reference", "x − x_r [km]"))
+        kinds.append(("relative", "Position relative to the reference", "x - x_r [km]"))
     for name, title, unit in kinds:
         traces: list[Trace] = []
         for train, rows in drawn.trains.slices():
@@ -138,19 +138,19 @@ def _spacings(drawn: Drawn) -> Iterator[Panel]:
         return
     time, spacing = links.column("time_s"), links.column("spacing_m")
     keys = np.column_stack([links.column(name) for name in ("desired_m", "lower_m", "upper_m")])
-    groups: dict[tuple[float, float, float], list[tuple[int, Floats]]] = {}
-    for k, (_, rows) in enumerate(links.slices()):
+    groups: dict[tuple[float, float, float], list[tuple[int, str, Any]]] = {}
+    for k, (name, rows) in enumerate(links.slices()):
         kinds, which = np.unique(keys[rows], axis=0, return_inverse=True)
         for j, kind in enumerate(kinds):
-            groups.setdefault(tuple(kind.tolist()), []).append((k, np.flatnonzero(which.ravel() == j) + rows.start))
+            groups.setdefault(tuple(kind.tolist()), []).append((k, name, np.flatnonzero(which.ravel() == j) + rows.start))
     colours = style.colours(len(links.names))
     shown = sorted(sorted(groups, key=lambda key: -len(groups[key]))[:4])
     for number, key in enumerate(shown):
         desired, lower, upper = key
         traces = [
-            _line(time[rows], spacing[rows] / 1000, f"link {links.names[k]}", _hex(colours[k]), len(groups[key]), group=links.names[k])
-            for k, rows in groups[key]
-        ]  # fmt: skip
+            _line(time[rows], spacing[rows] / 1000, f"link {name}", _hex(colours[k]), len(groups[key]), group=name)
+            for k, name, rows in groups[key]
+        ]
         bounds = _limits([lower / 1000, upper / 1000]) + [{"value": desired / 1000, "name": "desired", "dash": "dot"}]
         title = f"Spacing against bounds, desired {desired / 1000:g} km"
         note = (
@@ -269,7 +269,8 @@ def _events(drawn: Drawn) -> Iterator[Panel]:
     for k, (kind, items) in enumerate(sorted(by_kind.items())):
         some = items if len(items) <= most else items[:: -(-len(items) // most)]
         traces.append({
-            "x": [at for at, _ in some], "y": [kind] * len(some), "text": [text for _, text in some], "name": f"{kind} ({len(items)})",
+            "x": [at for at, _ in some], "y": [kind] * len(some), "text": [text for _, text in some],
+            "name": f"{kind} ({len(items)})",
             "color": _hex(style.COLOURS[k % len(style.COLOURS)]), "points": True,
         })  # fmt: skip
     yield panel("events", "Events", "", traces, categories=True, note="Hover for details.")

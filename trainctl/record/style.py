@@ -27,6 +27,8 @@ WIDTHS_MM = {"single": 85.0, "double": 178.0}
 #: Points drawn per line at most; beyond, each stretch is drawn by its least and greatest value.
 POINTS = 2000
 CROWD = 50  # lines
+#: A start so many times as large as the rest is left to the title of its panel.
+FOCUS = 3.0
 #: More lines than this are coloured by a scale, and only some of them named.
 NAMED = len(COLOURS)
 
@@ -68,6 +70,7 @@ def legend(figure: Figure, width: str, handles: Sequence[Any] | None = None) -> 
     longest = max(len(str(handle.get_label())) for handle in handles)
     points = WIDTHS_MM[width] / 25.4 * 72  # of the whole width; an entry takes about 26 and 3.9 per letter
     columns = int(np.clip(0.95 * points // (3.9 * longest + 26), 1, len(handles)))
+    columns = -(-len(handles) // -(-len(handles) // columns))  # rows of about the same length
     figure.legend(
         handles=handles, loc="outside upper center", ncols=columns, frameon=False, handlelength=1.8, columnspacing=1.2,
     )  # fmt: skip
@@ -141,6 +144,31 @@ def bound(axes: Axes, *values: float, label: str = "bound", **options: Any) -> N
         if np.isfinite(value):
             look: dict[str, Any] = {"color": GREY, "linestyle": (0, (5, 2)), "linewidth": 0.9, "label": label}
             axes.axhline(value, **(look | options))
+
+
+def focus(axes: Axes, time: Floats, low: Floats, high: Floats, after_s: float = 20.0) -> None:
+    """Scale a panel to what comes after the start if the start would hide it; how far the start goes then stands above.
+
+    Parameters
+    ----------
+    axes : Axes
+        The panel.
+    time, low, high : ndarray, shape (k,)
+        Time [s] and the least and greatest value drawn there.
+    after_s : float
+        Length of the start [s].
+    """
+    some = np.isfinite(low) & np.isfinite(high)
+    time, low, high = time[some], low[some], high[some]
+    later = time > time.min(initial=np.inf) + after_s
+    if not later.any():
+        return
+    bottom, top = low[later].min(), high[later].max()
+    if high.max() - low.min() <= FOCUS * (top - bottom) or top <= bottom:
+        return
+    spare = 0.12 * (top - bottom)
+    axes.set_ylim(bottom - spare, top + spare)
+    axes.set_title(f"beyond the scale in the first {after_s:g} s: {low.min():.4g} to {high.max():.4g}", loc="right", fontsize=7)
 
 
 def room(axes: Axes, least: float) -> None:

@@ -1,0 +1,133 @@
+"""The page of a run in headless Chromium: nothing on the console, nothing fetched, everything there and alive."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from trainctl.record.report import report
+
+sys.path.insert(0, str(Path(__file__).parent))
+from driver import Browser
+
+pytestmark = pytest.mark.browser
+
+READY = "return document.documentElement.dataset.ready === 'yes'"
+
+
+@pytest.fixture(scope="module")
+def page(finished):
+    return report(finished("three_tracks", "numeric"))
+
+
+@pytest.fixture
+def browser():
+    with Browser() as chromium:
+        yield chromium
+
+
+def moved_to(browser, time):
+    """Move the slider itself, as a hand would."""
+    script = """
+        const slider = document.getElementById('slider'), wanted = arguments[0];
+        const film = JSON.parse(document.getElementById('data').textContent).animation;
+        slider.value = film.time.indexOf(wanted); slider.dispatchEvent(new Event('input'));
+        return [document.getElementById('clock').textContent, document.getElementById('now-links').textContent, document.getElementById('now-trains').textContent];
+    """
+    return browser.run(script, time)
+
+
+def test_no_console_error_no_request_and_every_element(page, browser):
+    browser.open(page)
+    browser.until(READY)
+    assert browser.complaints() == []
+    assert [url for url in browser.requests() if not url.startswith(("file:", "data:", "blob:"))] == []
+    plots = browser.run(
+        "return [...document.querySelectorAll('.plot')].map(p => [p.id, p.querySelectorAll('svg.main-svg').length])"
+    )
+    assert {
+        "plot-graph",
+        "plot-speeds",
+        "plot-spacing",
+        "plot-inputs",
+        "plot-forces",
+        "plot-couplers",
+        "plot-energy",
+        "plot-events",
+    } <= {p for p, _ in plots}
+    assert all(count > 0 for _, count in plots)
+    for name in ("theme", "view", "play", "slider", "bounds", "now-links"):
+        assert browser.run(f"return document.getElementById('{name}') !== null"), name
+
+
+def test_slider_at_1000_and_1001_shows_the_change(page, browser, tmp_path):
+    browser.open(page)
+    browser.until(READY)
+    browser.run("document.getElementById('tracks').scrollIntoView()")
+    pictures = []
+    for time in (1000, 1001):
+        told = moved_to(browser, time)
+        browser.screenshot(tmp_path / f"{time}.png")
+        pictures.append(browser.run("return document.getElementById('view').toDataURL()"))
+        assert told[0] == f"{time} s"
+        if time == 1000:
+            assert "1→2" in told[1] and "4→6" in told[1]
+            assert "2: track 1" in told[2] and "5: track 2" in told[2]
+        else:
+            assert "1→3" in told[1] and "5→6" in told[1] and "1→2" not in told[1]
+            assert "2: crossover to track 3" in told[2] and "5: crossover to track 1" in told[2]
+    assert pictures[0] != pictures[1]
+    assert "2: track 3" in moved_to(browser, 1020)[2]
+    assert browser.complaints() == []
+
+
+def test_time_axes_are_linked_and_the_keyboard_works(page, browser):
+    browser.open(page)
+    browser.until(READY)
+    browser.run("document.getElementById('plot-speeds').focus()")
+    browser.press("+")
+    spans = "return [...document.querySelectorAll('.draw')].map(d => d._fullLayout.xaxis.range.map(Math.round).join())"
+    browser.until(f"const s = (() => {{ {spans} }})(); return new Set(s).size === 1 && s[0] === '600,1800'")
+    browser.press("0")
+    browser.until(f"const s = (() => {{ {spans} }})(); return new Set(s).size === 1 && s[0] === '0,2400'")
+    browser.run("document.activeElement.blur()")
+    browser.press("\ue014")  # right arrow
+    assert browser.run("return document.getElementById('clock').textContent") == "1 s"
+    browser.press(" ")
+    browser.until("return parseFloat(document.getElementById('clock').textContent) > 60")
+    browser.press(" ")
+    assert browser.run("return document.getElementById('play').textContent") == "Play"
+    assert browser.complaints() == []
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_follows_the_system_and_the_button(page, dark):
+    background = "return getComputedStyle(document.body).backgroundColor"
+    light, black = "rgb(255, 255, 255)", "rgb(20, 22, 26)"
+    with Browser(dark=dark) as browser:
+        browser.open(page)
+        browser.until(READY)
+        assert browser.run(background) == (black if dark else light)
+        browser.run("document.getElementById('theme').click()")
+        assert browser.run(background) == (light if dark else black)
+        assert browser.complaints() == []
+
+
+def test_a_million_rows_are_drawn_and_moved_quickly(tmp_path):
+    sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
+    from test_report import made_up
+
+    page = report(made_up(tmp_path / "run", 250, 4000))
+    with Browser() as browser:
+        browser.open(page)
+        browser.until(READY, 120.0)
+        slowest = browser.run("""
+            let worst = 0;
+            const slider = document.getElementById('slider');
+            for (let k = 0; k < slider.max; k += 7) { const t = performance.now(); slider.value = k; slider.dispatchEvent(new Event('input')); worst = Math.max(worst, performance.now() - t); }
+            return worst;
+        """)
+        assert slowest < 100.0
+        assert browser.complaints() == []

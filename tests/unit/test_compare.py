@@ -1,0 +1,75 @@
+"""Runs side by side, and one traffic under every law."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from trainctl.cli import app
+from trainctl.prepare import laws, prepare
+from trainctl.record.compare import PANELS, alternatives, figures, names, table
+from trainctl.scenario import examine, find, read
+
+
+@pytest.fixture(scope="module")
+def runs(finished):
+    short = {"run.duration_s": 60}
+    return [finished("fully_distributed", "numeric", **short), finished("fully_distributed_loss", "numeric", **short)]
+
+
+def test_a_row_has_one_value_per_run(runs):
+    rows = {row["metric"]: row for row in table(runs)}
+    assert rows["bounds.spacing_lower_margin_m"]["unit"] == "m"
+    assert [len(row["values"]) for row in rows.values()] == [2] * len(rows)
+    assert rows["formation.final_error_m"]["values"] == [run.metrics["formation.final_error_m"] for run in runs]
+
+
+def test_names_tell_folders_apart(finished, runs):
+    assert names(runs) == ["fully_distributed", "fully_distributed_loss"]
+    twice = names([runs[0], finished("fully_distributed", "numeric", **{"run.duration_s": 61})])
+    assert len(set(twice)) == 2
+    assert len(set(names([runs[0], runs[0]]))) == 2
+
+
+def test_figures_have_a_panel_per_run_on_one_scale(runs, tmp_path):
+    written = figures(runs, ["a", "b"], tmp_path)
+    assert [path.name for path in written] == [f"compare_{name}.png" for name in PANELS]
+    assert all(path.stat().st_size > 5000 for path in written)
+
+
+def test_every_law_can_be_put_in_front_of_three_tracks():
+    data, path = read("three_tracks")
+    found = alternatives(data, laws())
+    assert list(found)[:5] == ["fully_distributed", "robust_constrained", "emu_finite_time", "ordinary_consensus", "fault_tolerant"]
+    assert ("sumo" in found) == ("sumo" in laws())
+    assert found["fully_distributed"] == data
+    for name, changed in found.items():
+        assert [changed[key] for key in ("train", "event", "network", "reference", "bounds", "link")] == [
+            data[key] for key in ("train", "event", "network", "reference", "bounds", "link")
+        ], name
+        scenario, mistakes = examine(changed)
+        assert mistakes == [], name
+        prepare(scenario, path.name, path.parent)
+    assert found["ordinary_consensus"]["controller"]["alpha_1"] == 1.0
+
+
+def test_laws_that_cannot_drive_the_traffic_are_named_with_the_reason(tmp_path):
+    typed = [
+        "compare",
+        str(find("fully_distributed")),
+        "--controllers",
+        "all",
+        "--backend",
+        "numeric",
+        "--set",
+        "run.duration_s=20",
+        "--json",
+    ]
+    done = CliRunner().invoke(app, [*typed, "--out", str(tmp_path)], catch_exceptions=False)
+    told = json.loads(done.stdout)
+    assert {"fully_distributed", "robust_constrained"} <= set(told["runs"])
+    assert any("runs on coupled_units" in reason for reason in told["left_out"]["emu_finite_time"])
+    assert (tmp_path / "fully_distributed" / "run.json").is_file()
+    assert (tmp_path / "compare_speeds.png").is_file()
