@@ -1,0 +1,64 @@
+"""The bench runs every case, tells what it says, and its cases are what they claim to be."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+FILE = Path(__file__).resolve().parents[2] / "tools" / "bench.py"
+spec = importlib.util.spec_from_file_location("bench", FILE)
+bench = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(bench)
+
+
+@pytest.mark.parametrize("case", [*bench.IN_SUMO, *bench.NUMERIC])
+def test_scenarios_have_the_trains_they_say_on_edges_of_5_km(case):
+    text, line = bench.scenario(case, 100, 50)
+    data, net = tomllib.loads(text), tomllib.loads(line)
+    assert len(data["train"]) == 100
+    assert {t["track"] for t in data["train"]} == {1, 2, 3}
+    assert net["max_edge_m"] == 5000.0
+    assert max(t["position_m"] for t in data["train"]) + 50 * 90 < net["length_m"]
+
+
+def test_time_inside_a_part_is_not_that_of_the_part_around_it(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(bench.time, "perf_counter", lambda: now[0])
+    clock = bench.Clock()
+    with clock.part("write"):
+        now[0] += 1.0
+        with clock.part("step"):
+            now[0] += 10.0
+        with clock.part("read"):
+            now[0] += 100.0
+        now[0] += 1000.0
+    now[0] += 10_000.0
+    assert (clock.spent["write"], clock.spent["step"], clock.spent["read"]) == (1001.0, 10.0, 100.0)
+
+
+def test_rows_are_medians_per_train_and_step():
+    results = [{"steps": 10, "seconds": [s], "parts": {"step": s / 2}, "peak_mb": s} for s in (3.0, 1.0, 2.0)]
+    row = bench.row("loop", 100, results)
+    assert row["us_per_train_step"] == pytest.approx(2000.0)
+    assert (row["step_us"], row["read_us"], row["peak_mb"]) == (pytest.approx(1000.0), 0.0, 3.0)
+    assert row["times_real_time"] == pytest.approx(5.0)
+
+
+def test_one_command_measures_side_by_side():
+    command = [sys.executable, FILE, "--trains", "6", "--only", "bare", "--only", "loop", "--repeats", "1", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    rows = {row["case"]: row for row in json.loads(done.stdout)}
+    assert rows["bare"]["ratio_to_bare"] == 1.0
+    assert rows["loop"]["ratio_to_bare"] == pytest.approx(
+        rows["loop"]["us_per_train_step"] / rows["bare"]["us_per_train_step"], rel=1e-2
+    )
+    parts = sum(rows["loop"][f"{part}_us"] for part in bench.PARTS)
+    assert 0.5 * rows["loop"]["us_per_train_step"] < parts <= 1.01 * rows["loop"]["us_per_train_step"]
+    assert all(row["peak_mb"] > 10 for row in rows.values())
