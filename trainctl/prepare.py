@@ -386,7 +386,8 @@ def _reroute(
         if event.to_track not in line.track_ids:
             found.append(f"{here}.to_track = {event.to_track}: no such track; there are: {', '.join(line.track_ids)}")
             return track, at_least
-        ahead = line.next_crossover(track, passed, str(event.to_track))
+        on_line = line.begin_m <= passed <= line.end_m
+        ahead = line.next_crossover(track, passed, str(event.to_track)) if on_line else None
         if ahead is None:
             found.append(f"{here}.to_track = {event.to_track}: no crossover from track {track} to it beyond {passed:.10g} m")
             return track, at_least

@@ -12,6 +12,7 @@ import importlib.resources
 import json
 import math
 import tomllib
+from collections.abc import Iterator
 from collections import Counter
 from functools import cached_property
 from pathlib import Path
@@ -449,7 +450,7 @@ def _read(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
     """The tables of a file, laid over those of the scenario it extends."""
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # not TOML, not text, a number of 5000 digits
         raise InputError(f"{path.name}: not a TOML file: {error}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
@@ -512,8 +513,9 @@ def examine(data: dict[str, Any]) -> tuple[Scenario | None, list[str]]:
     With mistakes, the scenario is what remains without the keys that are wrong, so that the others can still be checked; None if
     too little remains.
     """
-    found: list[str] = []
-    rest = data
+    beyond = list(_beyond(data))
+    found = [f"{_key(list(place), data)} = {value}: beyond {GREATEST:g}" for place, value in beyond]
+    rest = _without(data, [place for place, _ in beyond]) if beyond else data
     for _ in range(3):
         try:
             # JSON has the same types as TOML but for dates, and lets arrays stand for tuples under strict rules.
@@ -531,6 +533,19 @@ def examine(data: dict[str, Any]) -> tuple[Scenario | None, list[str]]:
             wrong = scenario.cross_references()
             return (None if wrong else scenario), list(dict.fromkeys([*found, *wrong]))
     return None, list(dict.fromkeys(found))
+
+
+#: No quantity of a railway is greater in SI units; products of several still are finite.
+GREATEST = 1e15
+
+
+def _beyond(value: Any, place: tuple[int | str, ...] = ()) -> Iterator[tuple[tuple[int | str, ...], Any]]:
+    """Places of numbers that are too great to compute with; seeds are no quantities."""
+    if isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _beyond(item, (*place, key))
+    elif isinstance(value, int | float) and GREATEST < abs(value) < math.inf and place[-1] != "seed":
+        yield place, value
 
 
 def _without(data: Any, places: list[tuple[int | str, ...]]) -> Any:

@@ -12,6 +12,7 @@ import pytest
 
 from sumo_net import Line, LineError
 from trainctl.errors import InputError
+from trainctl.prepare import open_scenario
 from trainctl.record.diff import diff
 from trainctl.record.metrics import metrics
 from trainctl.record.run import Run
@@ -107,3 +108,27 @@ def test_a_number_against_nothing(tmp_path):
     column = report.tables[0].columns["duration"]
     assert (column.first.a, column.first.b, column.first.difference) == (1.0, None, float("inf"))
     json.dumps(report.as_dict())
+
+
+SCENARIOS = {
+    "a number too great to compute with": ("bounds", "speed_upper_mps = 1e300", "bounds.speed_upper_mps = 1e+300: beyond 1e+15"),
+    "an integer too great for a float": ("bounds", f"speed_upper_mps = {10**400}", "beyond 1e+15"),
+    "an integer too great to be read": ("bounds", f"speed_upper_mps = {'9' * 5000}", "not a TOML file"),
+    "a train that is beyond the line when it is rerouted": (
+        "topology", 'weight = 1.0\n[[event]]\nkind = "reroute"\ntrain = 2\nto_track = 3\ntime_s = 100000', "no crossover from track 1 to it",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", SCENARIOS)
+def test_a_scenario_that_broke_the_check(tmp_path, case):
+    table, text, words = SCENARIOS[case]
+    (tmp_path / "s.toml").write_text(f'extends = "fully_distributed"\n[{table}]\n{text}\n')
+    with pytest.raises(InputError) as told:
+        open_scenario(str(tmp_path / "s.toml"))
+    assert any(words in line for line in told.value.mistakes), told.value.mistakes
+
+
+def test_a_seed_may_be_a_great_number(tmp_path):
+    (tmp_path / "s.toml").write_text(f'extends = "fully_distributed"\n[run]\nseed = {10**18}\n')
+    assert open_scenario(str(tmp_path / "s.toml")).scenario.run.seed == 10**18

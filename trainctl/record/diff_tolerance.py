@@ -88,7 +88,7 @@ def read_tolerances(path: Path | str) -> Tolerances:
     """
     try:
         data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # not TOML, not text, a number of 5000 digits
         raise InputError(f"{path}: not a TOML file: {error}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
