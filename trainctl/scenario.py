@@ -12,8 +12,8 @@ import importlib.resources
 import json
 import math
 import tomllib
-from collections.abc import Iterator
 from collections import Counter
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
