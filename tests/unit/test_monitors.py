@@ -1,0 +1,229 @@
+"""What is watched while a run goes on is found, located, and silent when nothing is wrong."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from trainctl.controllers import emu_finite_time, fault_tolerant
+from trainctl.monitors.bounds import Alarms
+from trainctl.monitors.energy import Balance
+from trainctl.motion import Motion
+from trainctl.plants.coupled_units import PER_INERTIA
+from trainctl.plants.integrate import Extremes
+from trainctl.prepare import open_scenario
+from trainctl.record.journal import Row
+from trainctl.runner import opened
+from trainctl.signals import POSITION, SPEED
+from trainctl.world import Seen
+
+
+def row_of(p, t=0.0, watched=0, **changes):
+    """One quiet instant of a scenario's start."""
+    n = len(p.scenario.train)
+    own = p.own.copy()
+    heads = own[p.heads]
+    given = {
+        "time": t, "seen": Seen(heads[:, POSITION].copy(), np.zeros(n, np.int64)), "track": p.start_track, "own": own,
+        "speed": heads[:, SPEED].copy(), "ahead": np.full(n, -1), "links": p.first_links,
+        "motion": Motion(np.zeros(n), np.zeros(n), np.zeros(n, bool), np.zeros(n, bool), None, {}),
+        "saturated": np.zeros(n, bool), "extremes": Extremes.fresh(n, len(own), watched), "disturbed": None,
+    }  # fmt: skip
+    return Row(**{**given, **changes})
+
+
+def told(alarms, row):
+    return [(a["bound"], a["who"], a["value"], a["limit"]) for a in alarms.new(row)]
+
+
+@pytest.fixture(scope="module")
+def emu():
+    return open_scenario("emu_finite_time")
+
+
+@pytest.fixture(scope="module")
+def units():
+    return open_scenario("three_tracks")
+
+
+@pytest.fixture(scope="module")
+def tolerant():
+    return open_scenario("fault_tolerant")
+
+
+def test_a_quiet_row_is_silent(units):
+    alarms = Alarms(units)
+    assert told(alarms, row_of(units)) == []
+    assert (alarms.total, alarms.first) == (0, None)
+
+
+def test_the_first_violation_is_located_and_told_once(units):
+    alarms = Alarms(units)
+    fast = row_of(units).speed.copy()
+    fast[1] = 86.5
+    assert told(alarms, row_of(units, 7.0, speed=fast)) == [("speed_upper_mps", "2", 86.5, 85.0)]
+    assert told(alarms, row_of(units, 8.0, speed=fast)) == []
+    slow = fast.copy()
+    slow[4] = 70.0
+    assert told(alarms, row_of(units, 9.0, speed=slow)) == [("speed_lower_mps", "5", 70.0, 79.0)]
+    assert alarms.first == {"time_s": 7.0, "bound": "speed_upper_mps", "who": "2", "value": 86.5, "limit": 85.0}
+    assert (alarms.total, alarms.count["speed_upper_mps", "2"]) == (2, 3)
+
+
+def test_spacing_and_collision(units):
+    alarms = Alarms(units)
+    place = row_of(units).seen.position.copy()
+    place[2] = place[3] + 300.0  # 420 m is the least, the train 320 m long
+    found = told(alarms, row_of(units, seen=Seen(place, np.zeros(6, np.int64))))
+    assert ("gap_m", "3-4", pytest.approx(-20.0), 0.0) in found
+    assert ("spacing_lower_m", "3-4", pytest.approx(300.0), 420.0) in found
+
+
+def test_couplers_are_watched_between_rows(units):
+    x = Extremes.fresh(6, 24, 0)
+    x.coupler_max[5], x.coupler_min[5] = 0.12, -0.02
+    assert told(Alarms(units), row_of(units, extremes=x)) == [("coupler_upper_m", "2.2", 0.12, 0.1)]
+
+
+def linked(p):
+    alarms = Alarms(p)
+    groups = [list(range(len(p.scenario.train)))]
+    assert list(alarms.relinked(0.0, groups, np.zeros(len(p.scenario.train), np.int64), p.first_scene)) == []
+    assert told(alarms, row_of(p, watched=len(p.law.WATCHED))) == []  # extremes are those since the first links
+    return alarms
+
+
+def test_the_emergency_distance_of_the_finite_time_law(emu):
+    alarms = linked(emu)
+    x = Extremes.fresh(len(emu.scenario.train), len(emu.own), 1)
+    x.watched_min[2], x.watched_max[2] = 1499.0, 3000.0
+    assert told(alarms, row_of(emu, 1.0, extremes=x)) == [("interval_lower_m", "3", 1499.0, 1500.0)]
+
+
+def test_all_three_restrictions_of_the_fault_tolerant_law(tolerant):
+    lower, upper = fault_tolerant.watched_bounds(tolerant.params, tolerant.first_scene)
+    assert lower.shape == upper.shape == (len(tolerant.scenario.train), 3)
+    assert np.all(lower < 0) and np.all(upper > 0)
+    # Remark 2.1
+    assert np.allclose(upper[:, 2], tolerant.params.speed_error_upper_mps + tolerant.params.head_l1_per_s * lower[:, 0])
+    alarms = linked(tolerant)
+    x = Extremes.fresh(len(tolerant.scenario.train), len(tolerant.own), 3)
+    x.watched_min[:], x.watched_max[:] = 0.5 * lower, 0.5 * upper
+    x.watched_min[1, 0], x.watched_max[1, 1], x.watched_max[1, 2] = lower[1, 0] - 1, upper[1, 1] + 1, upper[1, 2] + 1
+    found = told(alarms, row_of(tolerant, 1.0, extremes=x))
+    assert [(bound, who) for bound, who, _, _ in found] == [
+        ("spacing_error_lower_m", "2"), ("speed_error_upper_mps", "2"), ("q_error_upper_mps", "2"),
+    ]  # fmt: skip
+
+
+def test_extremes_are_held_against_the_bounds_of_their_own_time(emu):
+    """A change of links in the middle of a recorded interval: what was seen before is not judged by what came after."""
+    alarms = linked(emu)
+    n = len(emu.scenario.train)
+    wider = replace(emu, params=emu.params.model_copy(update={"emergency_distance_m": 2000.0}))
+    alarms.p = wider
+    assert list(alarms.relinked(1.0, [list(range(n))], np.zeros(n, np.int64), emu.first_scene)) == []
+    x = Extremes.fresh(n, len(emu.own), 1)
+    x.watched_min[2], x.watched_max[2] = 1800.0, 3000.0
+    assert told(alarms, row_of(emu, 1.0, extremes=x)) == []  # of before
+    assert told(alarms, row_of(emu, 2.0, extremes=x)) == [("interval_lower_m", "3", 1800.0, 2000.0)]
+
+
+def test_a_formation_in_pieces(units):
+    alarms = Alarms(units)
+    formation = np.array([0, 0, 0, 0, 1, 0])
+    assert list(alarms.relinked(0.0, [[0, 1, 2, 3, 5], [4]], formation, units.first_scene)) == []
+    found = list(alarms.relinked(5.0, [[0, 1], [2, 3, 5], [4]], formation, units.first_scene))
+    assert found == [{"bound": "connected_pieces", "who": "1,2,3,4,6", "value": 2.0, "limit": 1.0}]
+    assert alarms.first is not None and alarms.first["time_s"] == 5.0
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("three_tracks", {"run.duration_s": 200, "run.record_every_s": 5}),
+        ("fault_tolerant", {"run.duration_s": 15}),
+        ("emu_finite_time", {"run.duration_s": 5}),
+        ("robust_three_tracks", {"run.duration_s": 60}),
+    ],
+)
+def test_energies_balance_far_better_than_demanded(name, settings, tmp_path):
+    with opened(open_scenario(name, settings), tmp_path / "run", "numeric") as simulation:
+        simulation.run()
+        balance = simulation.alarms.energy
+        assert np.all(balance.turnover > 1e6)
+        assert np.max(np.abs(balance.drift) / balance.turnover) < 1e-5
+        assert not [key for key in simulation.alarms.count if key[0] == "energy_balance_share"]
+
+
+def test_energy_from_nowhere_is_found(tmp_path):
+    """A plant that accelerates train 3 by a tenth more than its forces allow."""
+    with opened(open_scenario("three_tracks", {"run.duration_s": 30}), tmp_path / "run", "numeric") as simulation:
+        for _ in range(20):
+            simulation.step()
+        simulation.motion.plant.units[8:12, PER_INERTIA] *= 1.1
+        simulation.run()
+        assert ("energy_balance_share", "3") in simulation.alarms.count
+        assert ("energy_balance_share", "2") not in simulation.alarms.count
+        assert simulation.alarms.first["time_s"] > 20
+
+
+def test_a_kick_is_accounted_for(units):
+    balance = Balance(units)
+    own = units.own.copy()
+    kick = np.array([0.5, 0, 0, 0, 0, 0])
+    assert list(balance.broken(row_of(units, disturbed=SimpleNamespace(speed=kick)))) == []
+    own[:4, SPEED] += 0.5
+    assert list(balance.broken(row_of(units, own=own))) == []
+    assert abs(balance.drift[0]) < 1.0
+    own[4:8, SPEED] += 0.5  # nobody kicked train 2
+    assert [i for i, _ in balance.broken(row_of(units, own=own))] == [1]
+
+
+def test_what_alarms_remember_survives(units):
+    alarms, again = Alarms(units), Alarms(units)
+    told(alarms, row_of(units, 3.0, speed=np.full(6, 90.0)))
+    again.restore(alarms.values(), alarms.arrays())
+    assert again.values() == alarms.values()
+    assert told(again, row_of(units, 4.0, speed=np.full(6, 90.0))) == []
+
+
+def test_ten_thousand_trains_are_watched_in_milliseconds(units):
+    """Quiet rows of 10 000 trains of four units: 20 ms of a step of 1 s would be too much at a real-time factor of 10."""
+    n = 10_000
+    c = units.consists._replace(
+        first=np.arange(0, 4 * n + 1, 4),
+        **{
+            f: np.tile(getattr(units.consists, f)[:4], (n, 1) if f == "davis" else n)
+            for f in units.consists._fields
+            if f != "first"
+        },
+    )
+    place = np.arange(n, 0, -1) * 5000.0
+    own = np.stack([np.repeat(place, 4) - np.tile(np.arange(4) * 80.0, n), np.full(4 * n, 80.0)], axis=1)
+    ids = tuple(map(str, range(n)))
+    scenario = SimpleNamespace(ids=ids, train=ids, plant=units.scenario.plant, bounds=units.scenario.bounds)
+    bounds = type(units.bounds)(*(np.full(n, b[0]) for b in units.bounds))
+    p = SimpleNamespace(scenario=scenario, consists=c, bounds=bounds, law=units.law, sampled=True, own=own, heads=c.first[:-1])
+    k = np.arange(n - 1)
+    links = units.first_links._replace(
+        sender=k, receiver=k + 1, desired=np.full(n - 1, 5000.0), lower=np.full(n - 1, 420.0), upper=np.full(n - 1, 1e4)
+    )
+    alarms = Alarms(p)
+    row = row_of(SimpleNamespace(**vars(p), start_track=np.zeros(n, np.int64), first_links=links))
+    spent = []
+    for _ in range(7):
+        began = time.perf_counter()
+        assert told(alarms, row) == []
+        spent.append(time.perf_counter() - began)
+    assert min(spent) < 0.02, f"{1e3 * min(spent):.1f} ms"
+
+
+def test_the_laws_state_bounds_for_all_they_watch(emu):
+    low, high = emu_finite_time.watched_bounds(emu.params, emu.first_scene)
+    assert low.shape == high.shape == (len(emu.scenario.train), len(emu_finite_time.WATCHED))
+    assert np.all(low == 1500.0) and np.all(np.isinf(high))
