@@ -271,7 +271,7 @@ def state(simulation: Simulation) -> tuple[dict[str, Any], dict[str, Any]]:
     arrays: dict[str, Any] = {
         "own": s.own, "track": s.track, "formation": s.formation, "ahead": s.ahead, "links": s.links, "demand": s.demand,
         "relinked_own": own, "relinked_links": links, "constants": s.constants, "alarms": s.alarms.arrays(),
-        "sent": tuple(s.exchange.sent), "heard": s.exchange.heard, "ever": s.exchange.ever, "seen": seen,
+        "sent": tuple(s.exchange.sent), "heard": s.exchange.heard, "ever": s.exchange.ever, "outside": s.outside, "seen": seen,
     }  # fmt: skip
     if isinstance(motion, Units):
         values |= {"counted": motion.counted, "sent_at": motion.air.sent_at}
@@ -302,6 +302,7 @@ def restore(simulation: Simulation, tape: Tape, saved: Saved) -> None:
     s.constants = s.p.law.constants(s.p.params, scene)
     refill("constants", s.constants, arrays)
     s.alarms.restore(values["alarms"], [arrays[f"alarms.{k}"] for k in range(len(s.alarms.arrays()))])
+    s.outside = arrays["outside"].copy()
     s.exchange.heard, s.exchange.ever = arrays["heard"].copy(), arrays["ever"].copy()
     s.exchange.sent.extend(arrays[f"sent.{k}"].copy() for k in range(values["sent"]))
     motion = s.motion
