@@ -180,7 +180,7 @@ def _load(path: Path) -> Place:
     if content.lstrip().startswith("{"):
         try:
             return Place(json.loads(content), path.name)
-        except (json.JSONDecodeError, RecursionError) as error:
+        except (ValueError, RecursionError) as error:
             raise LineError([f"{path}: not JSON: {error}"]) from None
     import yaml
 

@@ -1,4 +1,4 @@
-"""Mutated scenarios, lines, nets, logs and run folders: one line per mistake, never a traceback, a hang, or a gigabyte.
+"""Mutated scenarios, lines, imports, nets, logs and run folders: one line per mistake, never a traceback, a hang, or a gigabyte.
 
 500 examples by default; ``pytest -m campaign tests/property/test_fuzz.py`` runs 10 000.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 import datetime
 import gzip
+import json
 import math
 import resource
 import shutil
@@ -21,11 +22,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import tomli_w
+import yaml
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import sumo_net
 from sumo_net import Line, LineError
+from sumo_net.importing import Options, convert
 from trainctl.errors import InputError
 from trainctl.facts import facts
 from trainctl.prepare import open_scenario
@@ -319,6 +322,51 @@ def fuzz_run(data, place, sumo):
         metrics(Run(copied))
 
 
+PERMIL = {"position": "m", "slope": "permil"}
+EFFORT = [[v, min(100e3, 6.5e6 / (v + 1))] for v in range(0, 141, 20)]
+IMPORTS = [
+    {
+        "metadata": {"id": "Hill"}, "stops": {"unit": "m", "values": [0.0, 2000.0, 9000.0]},
+        "speed limits": {"units": {"position": "m", "velocity": "km/h"}, "values": [[0.0, 90], [4000.0, 126]]},
+        "gradients": {"units": PERMIL, "values": [[0.0, 10.0], [3000.0, -20.5]]},
+    },
+    {
+        "metadata": {"id": "Swift"}, "length": {"value": 60.0, "unit": "m"}, "mass": {"value": 120.0, "unit": "t"},
+        "rho": {"value": 10, "unit": "%"}, "max traction power": {"value": 2.6, "unit": "MW"},
+        "max traction force": {"value": 200.0, "unit": "kN"}, "max reg braking power": {"value": 2600.0, "unit": "kW"},
+        "max reg braking force": {"value": 150.0, "unit": "kN"}, "max speed": {"value": 160, "unit": "km/h"},
+        "rolling resistance r0": {"value": 2.4, "unit": "kN"}, "rolling resistance r1": {"value": 0.017, "unit": "kN/(km/h)"},
+        "rolling resistance r2": {"value": 0.0009, "unit": "kN/(km/h)^2"},
+    },
+    {
+        "schema": "https://railtoolkit.org/schema/running-path.json",
+        "paths": [{"id": "valley", "characteristic_sections": [[100.0, 36.0, 0.0], [400.0, 36.0, 5.0], [1100.0, 72.0, 0.0]]}],
+    },
+    {
+        "schema": "https://railtoolkit.org/schema/rolling-stock.json", "trains": [{"id": "T1", "formation": ["motor", "motor"]}],
+        "vehicles": [{
+            "id": "motor", "vehicle_type": "multiple unit", "length": 40.0, "mass": 60.0, "load_limit": 10.0, "mass_traction": 40.0,
+            "rotation_mass": 1.1, "base_resistance": 3.0, "rolling_resistance": 1.5, "air_resistance": 4.0, "a_braking": -0.5,
+            "speed_limit": 120, "tractive_effort": EFFORT,
+        }],
+    },
+]  # fmt: skip
+
+
+def fuzz_import(data, place, sumo):
+    """A line or a train of another project."""
+    tree = data.draw(mutated(data.draw(st.sampled_from(IMPORTS))))
+    packed = json.dumps(tree, default=str)
+    if "metadata" not in tree:
+        packed = yaml.safe_dump(json.loads(packed))
+    content = packed.encode("utf-8", "surrogatepass")
+    if data.draw(st.integers(0, 4)) == 0:
+        content = data.draw(scarred(content))
+    (place / "import.txt").write_bytes(content)
+    with bounded():
+        convert(place / "import.txt", Options(coupler_stiffness_n_per_m=1e6))
+
+
 @pytest.fixture(scope="module")
 def sumo(finished, tmp_path_factory):
     """Logs of SUMO's in all formats, a net, and the tables of a run."""
@@ -347,7 +395,7 @@ def sumo(finished, tmp_path_factory):
 
 
 #: examples by default; the campaign runs twenty times as many
-EXAMPLES = {fuzz_scenario: 210, fuzz_line: 60, fuzz_log: 130, fuzz_net: 50, fuzz_run: 50}
+EXAMPLES = {fuzz_scenario: 200, fuzz_line: 50, fuzz_import: 50, fuzz_log: 120, fuzz_net: 40, fuzz_run: 40}
 
 
 def fuzzed(case, examples, tmp_path_factory, sumo, seed=None):
