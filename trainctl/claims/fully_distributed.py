@@ -229,7 +229,7 @@ def other_graphs(runs: Runs) -> Iterator[Claim]:
     yield claim("the law works on general networks: edges (1,3) and (4,6) kept beside the line, within 1 m after", "not stated",
                 f"{first} and {second}", "s", 0 < first < SWITCH and 0 < second < END - SWITCH)  # fmt: skip
     rng = np.random.default_rng(4)
-    graphs = [random_graph(rng) for _ in range(12)]
+    graphs = [random_graph(rng) for _ in range(8)]
     good = 0
     for edges in graphs:
         h = run(edges, periods=1200)
