@@ -56,11 +56,12 @@ def followed(scenario: Scenario, line: Line | None, plan: graph.Plan, consists: 
 
 
 def steep(p: Prepared) -> list[str]:
-    """Slopes on which the input bounds do not hold the speed: no input of Assumption 2.4 is left for control.
+    """Slopes that take too much of the input: on the steepest, what is left must do what the law asks of its bounds.
 
-    A law that clamps must hold the reference speed there; any other sampled law relies on the room in its whole speed band.
+    A law that clamps must hold the reference speed there; any other sampled law relies on the room in its whole speed band, and its
+    own rules (Assumption 2.4 of the fully distributed law) are asked again with the input bounds less the slope's share.
     """
-    if not p.sampled:
+    if not p.sampled or not p.line.gradient.slope.any():
         return []
     g, bounds = p.line.gradient, p.bounds
     clamped = getattr(p.law, "CLAMPED", False)
@@ -85,4 +86,17 @@ def steep(p: Prepared) -> list[str]:
                 f" {g.breaks[k]:.10g} m take {GRAVITY * slope:.4g} m/s2 and running resistance at {speed[i]:.6g} m/s"
                 f" {rolling[i]:.4g} m/s2, so nothing is left for control{among}"
             )
-    return found
+    return found or _rules_on_slopes(p)
+
+
+def _rules_on_slopes(p: Prepared) -> list[str]:
+    """What the law objects to on the steepest slopes, and not on the level."""
+    g, scene = p.line.gradient, p.first_scene
+    if p.law.violations(p.params, scene):
+        return []
+    rise, fall = max(float(g.slope.max()), 0.0), min(float(g.slope.min()), 0.0)
+    left = scene.bounds._replace(
+        input_lower=scene.bounds.input_lower - GRAVITY * fall, input_upper=scene.bounds.input_upper - GRAVITY * rise
+    )
+    slopes = f"input bounds less {1000 * rise:g} and {1000 * fall:g} per mil, the line's steepest slopes"
+    return [f"{rule} ({slopes})" for rule in p.law.violations(p.params, scene._replace(bounds=left))]

@@ -197,3 +197,26 @@ def test_a_slope_that_leaves_no_input_is_told_with_its_numbers(tmp_path):
         "train[1].input_upper_mps2 = 0.41: 40 per mil at 9000 m take 0.3923 m/s2 and running resistance at 28 m/s 0.01784 m/s2,"
         " so nothing is left for control (the first of 3 trains)"
     ]
+
+
+@pytest.mark.parametrize(("permil", "fits"), [(5.0, True), (10.0, False)])
+def test_what_a_slope_leaves_must_do_what_the_law_asks_of_its_bounds(tmp_path, permil, fits):
+    # 0.1 m/s up in 1 s needs 0.1 m/s2 besides the resistance, 0.01 + 1e-5 * 80.2^2 = 0.0743; 0.25 less 10 per mil leave 0.0776.
+    file = scenario(tmp_path, "speed_mps = 80.0", duration=60, gradient=f"[9000.0, {permil}]", room=0.25)
+    text = (tmp_path / "s.toml").read_text().replace('"robust_constrained"\nh_per_s = 0.5', '"fully_distributed"')
+    text = (
+        text.replace("follow_line = true\n", "")
+        .replace("speed_mps = 20.0", "speed_mps = 80.0")
+        .replace("weight = 0.01", "lower_m = 200.0\nupper_m = 900.0")
+    )
+    text = text.replace("speed_upper_mps = 40.0", "speed_upper_mps = 80.2").replace(
+        "speed_lower_mps = 0.0", "speed_lower_mps = 79.9"
+    )
+    plant, _, rest = text.partition("[plant]")[2].partition("[reference]")
+    assert plant
+    (tmp_path / "s.toml").write_text(text.partition("[plant]")[0] + "[reference]" + rest)
+    if fits:
+        open_scenario(file)
+        return
+    with pytest.raises(InputError, match=r"must be above 0\.17.* \(input bounds less 10 and 0 per mil"):
+        open_scenario(file)
