@@ -102,6 +102,8 @@ def run(
     """Run a scenario into a run folder: logs, metrics, SUMO's own logs."""
     from trainctl import runner
 
+    if gui and backend == "numeric":
+        raise InputError("--gui: shows SUMO; leave out --backend numeric")
     prepared = _scenario(name, settings)
     folder = out if out is not None else Path("runs") / Path(name).stem
     shown = not (quiet or as_json)
@@ -257,6 +259,7 @@ def plot(
     folder: RunFolder,
     out: Annotated[Path | None, typer.Option(help="Where the figures go; default FOLDER/figures.")] = None,
     formats: Annotated[list[str] | None, typer.Option("--format", help="png, svg, pdf; repeatable; default png.")] = None,
+    width: Annotated[Literal["single", "double"], typer.Option(help="A column of print (85 mm) or a page (178 mm).")] = "double",
 ) -> None:
     """Draw all figures that apply to a run."""
     from trainctl.record.figures import plot as draw
@@ -266,7 +269,7 @@ def plot(
     wrong = [f for f in wanted if f not in ("png", "svg", "pdf")]
     if wrong:
         raise InputError([f"--format {f}: must be one of png, svg, pdf" for f in wrong])
-    for path in draw(Run(folder), out or folder / "figures", wanted):
+    for path in draw(Run(folder), out or folder / "figures", wanted, width):
         print(path)
 
 

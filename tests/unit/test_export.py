@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 
 import numpy as np
@@ -34,7 +35,10 @@ def test_csv_gives_every_number_back_bit_by_bit(run, tmp_path, monkeypatch):
                 np.testing.assert_array_equal(read[column].to_numpy(float), table[column].to_numpy())
             else:
                 assert read[column].astype(str).tolist() == table[column].astype(str).tolist()
-    assert len(pd.read_csv(files[-1])) == len(run.events)
+    events = pd.read_csv(files[-1])
+    assert len(events) == len(run.events)
+    edges = events.loc[events["kind"] == "topology", "edges"].iloc[0]
+    assert json.loads(edges) == next(e["edges"] for e in run.events if e["kind"] == "topology")
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["events.csv", "links.csv", "trains.csv", "units.csv"]
 
 

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import xml.etree.ElementTree as ET
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from trainctl.cli import main
 from trainctl.errors import InputError, SimulatorError
 from trainctl.prepare import open_scenario
 from trainctl.runner import run
 from trainctl.sumo import gui
 from trainctl.sumo.replay import replay
-
-BIN = Path(sys.executable).parent / "trainctl"
 
 #: Train 1 takes the crossover to track 3 at 25 km in the 8th second.
 REROUTED = """extends = "three_tracks"
@@ -96,8 +92,18 @@ def test_a_window_that_is_closed_ends_the_run(scenario, tmp_path, monkeypatch):
     assert run(scenario, tmp_path / "r", gui="sumo").info["status"] == "complete"  # the next one starts
 
 
-def test_from_the_command_line(tmp_path):
-    watch = [BIN, "run", "fully_distributed", "--gui", "--gui-program", "sumo", "--set", "run.duration_s=5", "-q", "--out", "r"]
-    subprocess.run(watch, cwd=tmp_path, check=True)
-    done = subprocess.run([BIN, "replay", "r", "--gui-program", "sumo"], cwd=tmp_path, check=True, capture_output=True, text=True)
-    assert done.stdout.strip() == "5 steps shown"
+def test_from_the_command_line(tmp_path, monkeypatch, capsys):
+    def typed(*words):
+        monkeypatch.setattr("sys.argv", ["trainctl", *words])
+        with pytest.raises(SystemExit) as end:
+            main()
+        return end.value.code
+
+    monkeypatch.chdir(tmp_path)
+    watch = ("run", "fully_distributed", "--gui", "--gui-program", "sumo", "--set", "run.duration_s=5", "-q", "--out", "r")
+    assert typed(*watch) == 0
+    assert typed("replay", "r", "--gui-program", "sumo") == 0
+    assert capsys.readouterr().out.strip() == "5 steps shown"
+    assert typed(*watch, "--backend", "numeric") == 2
+    assert "--gui: " in capsys.readouterr().err
+    assert typed("replay", "r", "--from-s", "-1") == 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,6 +30,7 @@ MAT_BYTES = 2**31
 def to_csv(run: Run, folder: Path) -> list[Path]:
     """Write ``trains.csv``, ``units.csv``, ``links.csv`` and ``events.csv``, in pieces: memory does not grow with the run.
 
+    What is a list in an event is JSON in its field.
     Numbers are the shortest that give the same double again; what is not a number is an empty field.
 
     Parameters
@@ -66,7 +68,7 @@ def to_csv(run: Run, folder: Path) -> list[Path]:
             written.append(target)
     if not written:
         raise InputError(f"{run.folder}: no table recorded")
-    events = pd.json_normalize(run.events)
+    events = pd.DataFrame([{k: json.dumps(v) if isinstance(v, list | dict) else v for k, v in e.items()} for e in run.events])
     events.to_csv(folder / "events.csv", index=False)
     return [*written, folder / "events.csv"]
 
