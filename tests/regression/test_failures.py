@@ -182,7 +182,7 @@ def test_a_sampled_law_that_gives_nan(name, tmp_path, monkeypatch, capsys):
 def test_a_continuous_law_that_gives_nan(tmp_path):
     prepared = open_scenario("fault_tolerant", {"run.duration_s": 10})
     with (
-        pytest.raises(LawError, match="train 2.* is no longer finite after 3 s"),
+        pytest.raises(LawError, match=r"train 2.* is no longer finite after 3 s"),
         opened(prepared, tmp_path / "run", "numeric") as s,
     ):
         for _ in range(3):
@@ -208,7 +208,7 @@ def test_sumo_refuses(tmp_path):
 def test_something_else_moves_a_train(tmp_path):
     prepared = open_scenario("three_tracks", {"run.duration_s": 40})
     with (
-        pytest.raises(CouplingError, match="train 4 .*something else moved it .*speed mode"),
+        pytest.raises(CouplingError, match=r"train 4 .*something else moved it .*speed mode"),
         opened(prepared, tmp_path / "run") as s,
     ):
         for _ in range(20):
@@ -217,7 +217,7 @@ def test_something_else_moves_a_train(tmp_path):
         libsumo.vehicle.setMaxSpeed("4", 10.0)
         for _ in range(5):
             s.step()
-    reason, when, status = failure(tmp_path / "run.partial")
+    _, when, status = failure(tmp_path / "run.partial")
     assert (when, status) == (20.0, "failed")
     assert Run(tmp_path / "run.partial").trains.time_s.max() == 20
 
