@@ -15,7 +15,7 @@
     return stated ? stated === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
   };
   // black and the darkest blue do not show on a dark page
-  const shown = (color) => (color === "ink" || color === "#000000") ? css("--ink") : (isDark() && color === "#0072B2") ? "#4aa3df" : color;
+  const shown = (color) => (color === "ink" || color === "#000000") ? css("--ink") : (isDark() && color === "#0072B2") ? "#6f86ff" : color;
   const faint = (color) => { const c = shown(color); return c.startsWith("#") && c.length === 7 ? c + "2e" : c; };
 
   function traces(panel) {
