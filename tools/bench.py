@@ -5,7 +5,7 @@ of its own, since libsumo holds one simulation per process; the cases take turns
 and the median of the repeats is told.
 
 =================  ===============================================================================================================
-bare               SUMO stepping the trains at a constant commanded speed
+bare               SUMO stepping the trains, each at the constant commanded speed it starts with
 rail               SUMO's own ``Rail`` model drives the same trains on the same net
 loop               ours: ``fully_distributed`` on point trains, everything recorded
 traci              the same loop through TraCI, SUMO in a process of its own
@@ -16,7 +16,8 @@ actuated_units     numeric: ``fault_tolerant`` with its observer on trains of fo
 
 The net is fixed: three parallel tracks cut into edges of 5 km, ``bench_three_tracks``, as long as the trains need. The outputs of
 SUMO are those of a run (``trainctl.sumo.session.OPTIONS``) in bare, rail, loop and traci. A figure is the time from the first step
-until the logs are closed, per train and step [us]; ``peak_mb`` is the peak resident memory of the process that steps.
+until the logs are closed, per train and step [us]; ``peak_mb`` is the peak resident memory of the process that steps. Time of the
+processor is told too (``cpu_``, all threads): where others use the machine it is the truer figure.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import statistics
 import subprocess
 import sys
@@ -42,8 +44,8 @@ SPEED_MPS = 80.0
 SPACING_M = dict.fromkeys((*IN_SUMO, *NUMERIC), 500.0) | {"finite_time": 900.0, "actuated_units": 900.0}
 
 #: Train-steps of one repeat, about; the slower a case, the fewer.
-WORK = {"traci": 15_000, "coupled_units": 30_000, "finite_time": 30_000, "actuated_units": 15_000}
-IN_SUMO_WORK = 300_000
+WORK = {"traci": 15_000, "coupled_units": 15_000, "finite_time": 15_000, "actuated_units": 9_000}
+IN_SUMO_WORK = 200_000
 
 
 def steps_of(case: str, trains: int) -> int:
@@ -244,13 +246,13 @@ def alone(folder: Path, case: str, steps: int) -> dict[str, Any]:
         for name in names:
             libsumo.vehicle.setSpeedMode(name, 32)
             libsumo.vehicle.setLaneChangeMode(name, 0)
-            libsumo.vehicle.setSpeed(name, SPEED_MPS)
-    began = time.perf_counter()
+            libsumo.vehicle.setSpeed(name, libsumo.vehicle.getSpeed(name))
+    began, busy = time.perf_counter(), time.process_time()
     for _ in range(steps):
         libsumo.simulationStep()
     libsumo.close()
-    spent = time.perf_counter() - began
-    return {"trains": len(names), "seconds": [spent], "parts": {"step": spent}, "peak_mb": peak_mb()}
+    spent, cpu = time.perf_counter() - began, time.process_time() - busy
+    return {"trains": len(names), "seconds": [spent], "cpu": [cpu], "parts": {"step": spent}, "peak_mb": peak_mb()}
 
 
 def closed(folder: Path, case: str, steps: int) -> dict[str, Any]:
@@ -285,22 +287,25 @@ def closed(folder: Path, case: str, steps: int) -> dict[str, Any]:
         clock.around(world, "_read", "read")
         clock.around(libsumo, "simulationStep", "step")
     repeats = 1 if case in IN_SUMO else 3
-    seconds = []
+    seconds, cpu = [], []
     for _ in range(repeats):
-        began = time.perf_counter()
+        began, busy = time.perf_counter(), time.process_time()
         for _ in range(max(1, steps // repeats)):
             simulation.step()
         seconds.append(time.perf_counter() - began)
-    began = time.perf_counter()
+        cpu.append(time.process_time() - busy)
+    began, busy = time.perf_counter(), time.process_time()
     with clock.part("step"):
         world.close()
     with clock.part("record"):
         journal.close()
-    ended = time.perf_counter() - began
+    ended, closing = time.perf_counter() - began, time.process_time() - busy
+    closing += sum(os.times()[2:4])  # SUMO behind TraCI, from its start on
     count = repeats * max(1, steps // repeats)
-    seconds = [repeats * s + ended for s in seconds]
+    seconds, cpu = [repeats * s + ended for s in seconds], [repeats * s + closing for s in cpu]
     return {
-        "trains": len(prepared.scenario.ids), "steps": count, "seconds": seconds, "parts": clock.spent, "peak_mb": peak_mb(),
+        "trains": len(prepared.scenario.ids), "steps": count, "seconds": seconds, "cpu": cpu, "parts": clock.spent,
+        "peak_mb": peak_mb(),
     }  # fmt: skip
 
 
@@ -347,21 +352,29 @@ def python(*arguments: str) -> str:
     return done.stdout
 
 
-def measure(case: str, trains: int) -> dict[str, Any]:
-    """One repeat of one case."""
-    steps = steps_of(case, trains)
-    with tempfile.TemporaryDirectory(prefix="trainctl-bench-") as place:
-        folder = Path(place)
+def place(root: Path, case: str, trains: int) -> Path:
+    """Folder with what a case needs, made once."""
+    folder, steps = root / f"{case}-{trains}", steps_of(case, trains)
+    if not folder.exists():
+        folder.mkdir()
         text, line = scenario(case, trains, steps + 2)
         (folder / "scenario.toml").write_text(text, encoding="utf-8")
         (folder / "line.toml").write_text(line, encoding="utf-8")
         if case in ("bare", "rail"):
             python("--inputs", case, str(folder), str(trains), str(steps))
-        result: dict[str, Any] = json.loads(python("--case", case, str(folder), str(steps)).splitlines()[-1])
+    for old in ("sumo", "segments"):
+        shutil.rmtree(folder / old, ignore_errors=True)
+    return folder
+
+
+def measure(root: Path, case: str, trains: int) -> dict[str, Any]:
+    """One repeat of one case."""
+    steps = steps_of(case, trains)
+    result: dict[str, Any] = json.loads(python("--case", case, str(place(root, case, trains)), str(steps)).splitlines()[-1])
     return {"steps": steps, **result}
 
 
-def bench(sizes: list[int], cases: list[str], repeats: int) -> list[dict[str, Any]]:
+def bench(root: Path, sizes: list[int], cases: list[str], repeats: int) -> list[dict[str, Any]]:
     """Rows of all cases at all sizes, the cases taking turns."""
     rows = []
     for trains in sizes:
@@ -370,12 +383,14 @@ def bench(sizes: list[int], cases: list[str], repeats: int) -> list[dict[str, An
             for case in cases:
                 if turn == 0 or case in IN_SUMO:  # the numeric ones repeat within one process
                     print(f"{trains} trains, {case}, {turn + 1}", file=sys.stderr)
-                    found[case].append(measure(case, trains))
+                    found[case].append(measure(root, case, trains))
         rows += [row(case, trains, results) for case, results in found.items()]
         bare = next((r["us_per_train_step"] for r in rows if r["case"] == "bare" and r["trains"] == trains), None)
+        busy = next((r["cpu_us_per_train_step"] for r in rows if r["case"] == "bare" and r["trains"] == trains), None)
         for r in rows:
             if r["trains"] == trains:
                 r["ratio_to_bare"] = round(r["us_per_train_step"] / bare, 3) if bare else None
+                r["cpu_ratio_to_bare"] = round(r["cpu_us_per_train_step"] / busy, 3) if busy else None
     return rows
 
 
@@ -386,8 +401,9 @@ def row(case: str, trains: int, results: list[dict[str, Any]]) -> dict[str, Any]
     typical = statistics.median(times)
     parts = {p: statistics.median(r["parts"].get(p, 0.0) * scale / r["steps"] for r in results) for p in PARTS}
     return {
-        "case": case, "trains": trains, "us_per_train_step": round(typical, 3), "ratio_to_bare": None,
+        "case": case, "trains": trains, "us_per_train_step": round(typical, 3), "ratio_to_bare": None, "cpu_ratio_to_bare": None,
         "least_us": round(times[0], 3), "most_us": round(times[-1], 3),
+        "cpu_us_per_train_step": round(statistics.median(s * scale / r["steps"] for r in results for s in r["cpu"]), 3),
         "times_real_time": round(1e6 / (typical * trains), 1),
         "peak_mb": round(max(r["peak_mb"] for r in results), 1),
         **{f"{part}_us": round(spent, 3) for part, spent in parts.items()},
@@ -396,8 +412,11 @@ def row(case: str, trains: int, results: list[dict[str, Any]]) -> dict[str, Any]
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Rows in columns, with how the cost grows with the number of trains."""
-    columns = ["case", "trains", "us_per_train_step", "ratio_to_bare", "times_real_time", "peak_mb", *(f"{p}_us" for p in PARTS)]
-    heads = ["case", "trains", "us/train-step", "to bare", "x real time", "peak MB", *PARTS]
+    columns = [
+        "case", "trains", "us_per_train_step", "ratio_to_bare", "cpu_us_per_train_step", "cpu_ratio_to_bare", "times_real_time",
+        "peak_mb", *(f"{p}_us" for p in PARTS),
+    ]  # fmt: skip
+    heads = ["case", "trains", "us/train-step", "to bare", "CPU us", "CPU to bare", "x real time", "peak MB", *PARTS]
     lines = [heads, *([("" if r[c] is None else str(r[c])) for c in columns] for r in rows)]
     width = [max(len(line[k]) for line in lines) for k in range(len(heads))]
     text = [
@@ -427,7 +446,8 @@ def main() -> None:
         case, folder, steps = asked.case
         child(case, Path(folder), int(steps))
     else:
-        rows = bench(asked.trains or list(SIZES), asked.only or [*IN_SUMO, *NUMERIC], asked.repeats)
+        with tempfile.TemporaryDirectory(prefix="trainctl-bench-") as root:
+            rows = bench(Path(root), asked.trains or list(SIZES), asked.only or [*IN_SUMO, *NUMERIC], asked.repeats)
         print(json.dumps(rows, indent=2) if asked.json else table(rows))
 
 

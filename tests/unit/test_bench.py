@@ -43,7 +43,7 @@ def test_time_inside_a_part_is_not_that_of_the_part_around_it(monkeypatch):
 
 
 def test_rows_are_medians_per_train_and_step():
-    results = [{"steps": 10, "seconds": [s], "parts": {"step": s / 2}, "peak_mb": s} for s in (3.0, 1.0, 2.0)]
+    results = [{"steps": 10, "seconds": [s], "cpu": [s], "parts": {"step": s / 2}, "peak_mb": s} for s in (3.0, 1.0, 2.0)]
     row = bench.row("loop", 100, results)
     assert row["us_per_train_step"] == pytest.approx(2000.0)
     assert (row["step_us"], row["read_us"], row["peak_mb"]) == (pytest.approx(1000.0), 0.0, 3.0)
