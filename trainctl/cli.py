@@ -164,7 +164,10 @@ def _summary(done: Run, prepared: Prepared) -> None:
         if isinstance(metrics.get(key), int | float):
             table.add_row(words, f"{metrics[key]:.6g} {unit}")
     broken = info["violations"]
-    table.add_row("bounds", "all held" if not broken else f"{broken} broken: see kind = violation in events.jsonl")
+    where = ""
+    if first := info.get("first_violation"):
+        where = f", first {first['bound']} of {first['who']} at {first['time_s']:g} s"
+    table.add_row("bounds", "all held" if not broken else f"{broken} broken{where}: see kind = violation in events.jsonl")
     table.add_row("results", f"{done.folder}/  (trainctl plot {done.folder}; trainctl metrics {done.folder})")
     _print(table)
 
