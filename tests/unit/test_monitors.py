@@ -217,9 +217,9 @@ def test_ten_thousand_trains_are_watched_in_milliseconds(units):
     row = row_of(SimpleNamespace(**vars(p), start_track=np.zeros(n, np.int64), first_links=links))
     spent = []
     for _ in range(7):
-        began = time.perf_counter()
+        began = time.process_time()
         assert told(alarms, row) == []
-        spent.append(time.perf_counter() - began)
+        spent.append(time.process_time() - began)
     assert min(spent) < 0.02, f"{1e3 * min(spent):.1f} ms"
 
 
