@@ -17,8 +17,10 @@ import pytest
 import tomli_w
 
 from trainctl.errors import InputError
+from trainctl.reading import read
 from trainctl.record.diff import EXACT, Tolerance, Tolerances, diff, parse_tolerances, read_tolerances
-from trainctl.scenario import read
+from trainctl.record.diff_rows import compare
+from trainctl.record.diff_sources import Log
 
 LOSS = ("fully_distributed_loss", "numeric")
 SHORT = {"run.duration_s": 60}
@@ -268,8 +270,32 @@ def test_tripinfo_is_matched_by_vehicle_with_what_is_inside(tmp_path):
 
 def test_names_that_look_like_numbers_are_names(tmp_path):
     for name, lane in (("a", "1000000"), ("b", "1000001")):
-        (tmp_path / f"{name}.xml").write_text(fcd(times=[0]).replace('lane="0_1_0"', f'lane="{lane}"'))
+        (tmp_path / f"{name}.xml").write_text(fcd(times=[0], trains=("a",)).replace('lane="0_1_0"', f'lane="{lane}"'))
     assert not diff(tmp_path / "a.xml", tmp_path / "b.xml", Tolerances(Tolerance(10.0))).same
+
+
+def test_a_step_without_vehicles_is_no_row(tmp_path):
+    for name, ids in (("a", ["x", None, "x"]), ("b", ["x", "x"])):
+        times = [0.0, 1.0, 2.0] if name == "a" else [0.0, 2.0]
+        table = pa.table({"timestep_time": times, "vehicle_id": ids, "vehicle_speed": [1.0] * len(ids)})
+        pq.write_table(table, tmp_path / f"{name}.parquet")
+    report = diff(tmp_path / "a.parquet", tmp_path / "b.parquet")
+    assert report.same, report.lines()
+
+
+@pytest.mark.parametrize("gaps", [(0.1, 0.5, 0.2), (0.5, 0.1, 0.2), (0.1, 0.2, 0.5)])
+def test_the_largest_difference_of_all_pieces_is_kept(gaps):
+    def log(name, by):
+        def batches():
+            for k, gap in enumerate(by):
+                yield pa.table({"time": [float(k), k + 0.5], "id": ["x", "x"], "speed": [1.0, 1.0 + gap]})
+
+        return Log("fcd", name, "time", ("id",), batches)
+
+    column = compare(log("a", (0.0, 0.0, 0.0)), log("b", gaps), Tolerances(), {}).columns["speed"]
+    assert column.largest.difference == pytest.approx(0.5)
+    assert column.largest.time_s == gaps.index(0.5) + 0.5
+    assert (column.first.time_s, column.differing) == (0.5, 3)
 
 
 # Tolerances and the command
