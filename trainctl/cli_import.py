@@ -39,7 +39,7 @@ def net_import(
         float | None, typer.Option(min=0.0, help="Trains of several units: damping of their couplers [N s/m].")
     ] = None,
 ) -> None:
-    """Read a line or a train of another project into a TOML file: a line description, or a [train_type.NAME] table."""
+    """Read a line or a train of another project into a TOML file: a line description, or the table of a train type."""
     from sumo_net import LineError
     from sumo_net.importing import Options, convert
 
