@@ -83,7 +83,7 @@ def test_mistakes_are_told_before_anything_runs(plan, words):
 def test_one_start_that_is_refused_does_not_stop_the_others():
     plan = Plan("fully_distributed", {"bounds.speed_upper_mps": [70.0, 85.0]}, [], {})
     assert len(jobs(plan)) == 2
-    with pytest.raises(InputError, match="speed bounds 75 .. 70 are empty"):
+    with pytest.raises(InputError, match=r"speed bounds 75 \.\. 70 are empty"):
         jobs(Plan("fully_distributed", {"bounds.speed_upper_mps": [70.0]}, [], {}))
 
 
