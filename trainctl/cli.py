@@ -175,7 +175,7 @@ def _summary(done: Run, prepared: Prepared) -> None:
 @app.command("list")
 def list_(as_json: Json = False) -> None:
     """List the scenarios that come with the package."""
-    from trainctl.scenario import read, shipped
+    from trainctl.reading import read, shipped
 
     rows = []
     for name in shipped():

@@ -89,8 +89,8 @@ def _under_all(
     from trainctl.cli import _progress, _setting
     from trainctl.errors import TrainctlError
     from trainctl.prepare import laws, prepare
+    from trainctl.reading import examine, read
     from trainctl.record import compare as comparing
-    from trainctl.scenario import examine, read
 
     data, path = read(name, dict(map(_setting, settings or [])))
     runs, labels, left_out = [], [], {}

@@ -25,8 +25,9 @@ from sumo_net import Line, LineError
 from trainctl import controllers, observers, prepare_line
 from trainctl.errors import InputError
 from trainctl.plants import actuated_units, disturbance, point, shared
+from trainctl.reading import examine, mistakes, read
 from trainctl.reference import Profile
-from trainctl.scenario import Event, Scenario, examine, mistakes, read
+from trainctl.scenario import Event, Scenario
 from trainctl.signals import FORCE, POSITION, SPEED, Bounds, Consists, Floats, Ints, Links, Reference, Scene, leader_at
 from trainctl.topology import graph
 

@@ -24,6 +24,7 @@ from trainctl import checkpoint
 from trainctl.errors import InputError, SimulatorError
 from trainctl.loop import Simulation
 from trainctl.prepare import Prepared, prepare
+from trainctl.reading import examine
 from trainctl.record.folder import (
     about_run,
     claim,
@@ -39,7 +40,6 @@ from trainctl.record.folder import (
 from trainctl.record.journal import Journal
 from trainctl.record.metrics import metrics
 from trainctl.record.run import Run
-from trainctl.scenario import examine
 from trainctl.world import Numeric, World
 
 Backend = Literal["sumo", "numeric"]

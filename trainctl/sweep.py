@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from trainctl.errors import InputError, TrainctlError
-from trainctl.scenario import examine, find, read, shipped
+from trainctl.reading import examine, find, read, shipped
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -32,11 +32,11 @@ from sumo_net.importing import Options, convert
 from trainctl.errors import InputError
 from trainctl.facts import facts
 from trainctl.prepare import open_scenario
+from trainctl.reading import read, shipped
 from trainctl.record.diff import diff
 from trainctl.record.metrics import metrics
 from trainctl.record.run import Run
 from trainctl.record.traffic import metrics_of_fcd
-from trainctl.scenario import read, shipped
 
 #: No example may take more processor time than this [s], nor more memory beyond what the test began with.
 LIMIT_S, LIMIT_BYTES = 20.0, 1 << 30

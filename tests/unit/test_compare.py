@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 
 from trainctl.cli import app
 from trainctl.prepare import laws, prepare
+from trainctl.reading import examine, find, read
 from trainctl.record.compare import PANELS, alternatives, figures, names, table
-from trainctl.scenario import examine, find, read
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from trainctl.prepare import open_scenario
-from trainctl.scenario import Scenario, examine, load, shipped
+from trainctl.reading import examine, load, shipped
+from trainctl.scenario import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "scenarios" / "README.md").read_text()

@@ -12,8 +12,9 @@ import pandas as pd
 import sumo_net
 from sumo_net import Line, LineError
 from trainctl.errors import InputError, SimulatorError
+from trainctl.reading import examine
 from trainctl.record.run import Run
-from trainctl.scenario import Scenario, examine
+from trainctl.scenario import Scenario
 from trainctl.signals import Bools, Floats, Ints, Links
 from trainctl.sumo.gui import Gui
 from trainctl.world import Start
