@@ -123,11 +123,14 @@ def test_a_million_rows_are_drawn_and_moved_quickly(tmp_path):
     with Browser() as browser:
         browser.open(page)
         browser.until(READY, 120.0)
-        slowest = browser.run("""
-            let worst = 0;
-            const slider = document.getElementById('slider');
-            for (let k = 0; k < slider.max; k += 7) { const t = performance.now(); slider.value = k; slider.dispatchEvent(new Event('input')); worst = Math.max(worst, performance.now() - t); }
-            return worst;
+        took = browser.run("""
+            const took = [], slider = document.getElementById('slider');
+            for (let k = 0; k < slider.max; k += 7) {
+                const begun = performance.now();
+                slider.value = k; slider.dispatchEvent(new Event('input'));
+                took.push(performance.now() - begun);
+            }
+            return took.sort((a, b) => a - b);
         """)
-        assert slowest < 100.0
+        assert took[len(took) // 2] < 50.0  # ms; the median, as others may use the machine
         assert browser.complaints() == []

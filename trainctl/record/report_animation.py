@@ -93,7 +93,7 @@ def _lateral(drawn: Drawn, line: Line | None, tracks: list[str]) -> Floats:
     """Lateral place of every row: the number of its track, in between on a crossover."""
     frame = drawn.trains.frame
     number = {name: float(k) for k, name in enumerate(tracks)}
-    side: Floats = frame["track"].astype(str).map(number).to_numpy(dtype=np.float64).copy()
+    side: Floats = np.array(frame["track"].astype(str).map(number), dtype=np.float64)
     if line is None:
         return side
     edge, x = frame["edge"].astype(str).to_numpy(), drawn.trains.column("position_m")
