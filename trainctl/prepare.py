@@ -13,7 +13,6 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,7 @@ from trainctl.errors import InputError
 from trainctl.plants import actuated_units, disturbance, point, shared
 from trainctl.reading import examine, mistakes, read
 from trainctl.reference import Profile
-from trainctl.scenario import Event, Scenario
+from trainctl.scenario import Scenario
 from trainctl.signals import FORCE, POSITION, SPEED, Bounds, Consists, Floats, Ints, Links, Reference, Scene, leader_at
 from trainctl.topology import graph
 
@@ -239,7 +238,7 @@ def prepare(scenario: Scenario, file: str, folder: Path, known: Sequence[str] = 
     network = attempt(_network, scenario, folder)
     plan = attempt(_plan, scenario)
     if network is not None:
-        found += _on_the_line(scenario, network[0])
+        found += prepare_line.on_the_line(scenario, network[0])
     if any(part is None for part in (law, params, observer, observer_params, plant_params, plan)):
         raise InputError([f"{file}: {line}" for line in found])
 
@@ -266,7 +265,7 @@ def prepare(scenario: Scenario, file: str, folder: Path, known: Sequence[str] = 
     ]  # fmt: skip
     if network is not None:
         prepared = replace(prepared, line=network[0], spec=network[1], net=network[2])
-        found += [*_long_enough(prepared), *prepare_line.steep(prepared)]
+        found += [*prepare_line.long_enough(prepared), *prepare_line.steep(prepared)]
     if found:
         # What follows from a key that is wrong already is not a mistake of its own.
         wrong = [line.partition(" = ")[0].partition(":")[0].rpartition(".")[2] for line in known]
@@ -340,76 +339,6 @@ def _plan(scenario: Scenario) -> graph.Plan:
 def _exchange_period(scenario: Scenario) -> float:
     run = scenario.run
     return scenario.topology.communication_period_s or run.control_period_s or run.step_s
-
-
-def _on_the_line(scenario: Scenario, line: Line) -> list[str]:
-    """Trains beside the line or inside one another, crossovers that do not exist or are behind."""
-    found, placed = [], []
-    for t in scenario.train:
-        here = f"train[{t.id}]"
-        if t.track not in line.track_ids:
-            found.append(f"{here}.track = {t.track}: no such track; there are: {', '.join(line.track_ids)}")
-        elif not line.begin_m <= t.position_m <= line.end_m:
-            found.append(
-                f"{here}.position_m = {t.position_m:.10g}: off the line, which is {line.begin_m:.10g} .. {line.end_m:.10g} m"
-            )
-        else:
-            kind = scenario.train_type[t.type]
-            length = math.fsum(kind.per_unit("unit_length_m"))
-            if t.position_m - length < line.begin_m:
-                tail = t.position_m - length
-                found.append(
-                    f"{here}.position_m = {t.position_m:.10g}: its tail at {tail:.10g} m is off the line, which begins at"
-                    f" {line.begin_m:.10g} m"
-                )
-            placed.append((t.track, t.position_m, length, t.id))
-    for (track, x, length, i), (other, y, _, j) in pairwise(sorted(placed, key=lambda p: (p[0], -p[1]))):
-        if (track == other and y > x - length) or (track == other and y == x):
-            found.append(
-                f"train[{j}].position_m = {y:.10g}: overlaps train {i} on track {track}, whose rear is at {x - length:.10g} m"
-            )
-    where = {t.id: (t.track, t.position_m, t) for t in scenario.train}
-    for k, event in sorted(enumerate(scenario.event, 1), key=lambda e: e[1].time_s):
-        track, at_least, t = where[event.train]
-        if track in line.track_ids:
-            where[event.train] = (*_reroute(f"event[{k}]", event, scenario, line, track, at_least, found), t)
-    return found
-
-
-def _reroute(
-    here: str, event: Event, scenario: Scenario, line: Line, track: str, at_least: float, found: list[str]
-) -> tuple[str, float]:
-    """Check one reroute as far as it is certain before the run; where the train is afterwards, at least."""
-    train = next(t for t in scenario.train if t.id == event.train)
-    slowest = train.speed_lower_mps if train.speed_lower_mps is not None else scenario.bounds.speed_lower_mps
-    passed = max(at_least, train.position_m + max(slowest or 0.0, 0.0) * event.time_s)
-    if event.crossover is None:
-        if event.to_track not in line.track_ids:
-            found.append(f"{here}.to_track = {event.to_track}: no such track; there are: {', '.join(line.track_ids)}")
-            return track, at_least
-        on_line = line.begin_m <= passed <= line.end_m
-        ahead = line.next_crossover(track, passed, str(event.to_track)) if on_line else None
-        if ahead is None:
-            found.append(f"{here}.to_track = {event.to_track}: no crossover from track {track} to it beyond {passed:.10g} m")
-            return track, at_least
-        return ahead.to_track, ahead.start_m
-    named = {c.id: c for c in line.crossovers}
-    if event.crossover not in named:
-        near = [c.id for c in line.crossovers if c.from_track == track and c.start_m > passed][:3]
-        hint = f"; next on track {track}: {', '.join(near)}" if near else ""
-        found.append(f"{here}.crossover = {event.crossover}: no such crossover{hint}")
-        return track, at_least
-    crossover = named[event.crossover]
-    if crossover.from_track != track:
-        found.append(
-            f"{here}.crossover = {crossover.id}: leaves track {crossover.from_track}, train {event.train} is on track {track}"
-        )
-    elif crossover.start_m <= passed:
-        found.append(
-            f"{here}.crossover = {crossover.id}: its switch at {crossover.start_m:.10g} m has been passed, train {event.train}"
-            f" is at {passed:.10g} m or beyond at {event.time_s:g} s"
-        )
-    return crossover.to_track, max(at_least, crossover.start_m)
 
 
 def _initial(scenario: Scenario, consists: Consists, states: int) -> Floats:
@@ -496,18 +425,6 @@ def _fits(p: Prepared) -> list[str]:
                     f" {greatest[i]:.6g} m/s2 at most in the speed band"
                 )
     return found
-
-
-def _long_enough(p: Prepared) -> list[str]:
-    """Trains that would run off the line's end at the reference speed."""
-    end = p.scenario.run.duration_s
-    travel = p.leader(end)[0] - p.leader(0.0)[0]
-    return [
-        f"run.duration_s = {end:g}: at the reference speed train {t.id} reaches {t.position_m + travel:.0f} m, beyond the"
-        f" line's end at {p.line.end_m:.10g} m"
-        for t in p.scenario.train
-        if t.position_m <= p.line.end_m < t.position_m + travel
-    ]
 
 
 def _messages_fit(p: Prepared) -> list[str]:
