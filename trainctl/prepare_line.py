@@ -1,4 +1,4 @@
-"""What the line means for a scenario: where trains and crossovers are, a reference that obeys its limits, slopes that leave room."""
+"""What the line means for a scenario: places of trains and crossovers, a reference inside its limits, slopes that leave room."""
 
 from __future__ import annotations
 
