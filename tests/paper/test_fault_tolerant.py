@@ -73,7 +73,21 @@ def small_steps(every: float, duration: float) -> tuple[Example, list[np.ndarray
     states, estimates = [own.copy()], [estimate.copy()]
     for k in range(round(duration / every)):
         integrate.advance(
-            parts, loop, c.first, c.length, s.links, s.reference, air, k * every, 0.002, n, np.zeros(0), own, estimate, work, extremes
+            parts,
+            loop,
+            c.first,
+            c.length,
+            s.links,
+            s.reference,
+            air,
+            k * every,
+            0.002,
+            n,
+            np.zeros(0),
+            own,
+            estimate,
+            work,
+            extremes,
         )
         states.append(own.copy())
         estimates.append(estimate.copy())

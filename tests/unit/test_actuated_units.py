@@ -90,7 +90,9 @@ def test_standstill_is_held_and_left_forward_only():
 
 
 def test_limits_are_effort_and_power_of_each_unit():
-    constants = made(traction=np.full(4, 8e4), braking=np.full(4, 6e4), traction_power=np.full(4, 1e6), braking_power=np.full(4, 9e5))
+    constants = made(
+        traction=np.full(4, 8e4), braking=np.full(4, 6e4), traction_power=np.full(4, 1e6), braking_power=np.full(4, 9e5)
+    )
     applied = np.array([9e4, -9e4, 4e4])
     assert plant.limit(0, constants, OWN[:3], applied)
     np.testing.assert_allclose(applied, [1e6 / 20.0, -9e5 / 21.0, 4e4])
@@ -108,7 +110,9 @@ def test_windows_are_open_as_within_the_step_and_the_phase_counts_from_time_zero
 
 def test_effectiveness_holds_in_its_window_and_what_is_lost_is_logged_as_a_fault():
     loss = {"kind": "effectiveness", "amplitude_n_per_s": None}
-    table = tabulated([fault(**loss, effectiveness=0.0), fault(**loss, effectiveness=0.5, start_s=20.0, end_s=30.0)], ("1", "2"), consists())
+    table = tabulated(
+        [fault(**loss, effectiveness=0.0), fault(**loss, effectiveness=0.5, start_s=20.0, end_s=30.0)], ("1", "2"), consists()
+    )
     assert [effectiveness(table, 1, t) for t in (5.0, 15.0, 20.0, 30.0)] == [1.0, 0.0, 0.5, 1.0]
     lost = plant.fault(made([fault(**loss, effectiveness=0.0)]), 15.0, np.full(4, 1e4))
     np.testing.assert_allclose(lost, [0.0, -40.0 * 1e4 / 6e4, 0.0, 0.0])

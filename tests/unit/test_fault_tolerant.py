@@ -196,7 +196,10 @@ def test_a_sound_scene_has_no_violations():
     [
         ({"head_l2": 2.0}, ["head_l2 = 2: must be above 2"]),
         ({"head_l3": 4.2}, ["head_l3 = 4.2: must be above 2 + head_l2^2 / 2 = 4.205"]),
-        ({"head_l2": 3.0, "head_l4": 0.5}, ["head_l3 = 4.3: must be above 2 + head_l2^2 / 2 = 6.5", "head_l4 = 0.5: must be above 1/2"]),
+        (
+            {"head_l2": 3.0, "head_l4": 0.5},
+            ["head_l3 = 4.3: must be above 2 + head_l2^2 / 2 = 6.5", "head_l4 = 0.5: must be above 1/2"],
+        ),
         ({"speed_error_upper_mps": 20.0}, ["head_l1_per_s = 0.01: must be below min(sigma2 / rho1, sigma1 / rho2) = 0.008507"]),
     ],
 )

@@ -30,7 +30,9 @@ def scene(sub_step=0.01):
     none, b = np.zeros(0), np.full(1, INF)
     links = Links(none.astype(int), none.astype(int), np.zeros(2, int), none, none, none, none, none > 0, np.zeros(1), np.arange(1))
     own = np.array([[1000.0, 40.0, 5e4], [973.7, 40.3, -2e4], [950.1, 39.8, 1e4]])
-    return Scene(("1",), c, own, links, Bounds(-b, b, -b, b), Reference(np.array([0.0, INF]), np.zeros((1, 2))), 0.0, 1.0, 1.0, 0.5, sub_step)
+    return Scene(
+        ("1",), c, own, links, Bounds(-b, b, -b, b), Reference(np.array([0.0, INF]), np.zeros((1, 2))), 0.0, 1.0, 1.0, 0.5, sub_step
+    )
 
 
 def plant_rate(constants, own, applied, t=0.0):
@@ -174,7 +176,9 @@ def test_width_follows_the_fault_model():
         params = asymptotic.Params(fault_sinusoids=sinusoids)
         assert asymptotic.initial(params, scene().own).shape == (3, asymptotic.width(params)) == (3, 4 + 2 * len(sinusoids))
         constants = asymptotic.constants(params, scene())
-        assert np.isfinite(observed(asymptotic, constants, scene().own, asymptotic.initial(params, scene().own), np.zeros(3))[1]).all()
+        assert np.isfinite(
+            observed(asymptotic, constants, scene().own, asymptotic.initial(params, scene().own), np.zeros(3))[1]
+        ).all()
 
 
 @pytest.mark.parametrize(

@@ -133,9 +133,7 @@ def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out:
 
 
 @compiled()
-def rate(
-    i: int, constants: Constants, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats
-) -> None:
+def rate(i: int, constants: Constants, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats) -> None:
     """d(estimate)/dt; the input is what was applied after the limits."""
     c, m = constants, constants.train
     for j in range(len(own)):

@@ -184,9 +184,7 @@ def limit(i: int, constants: Constants, own: Floats, applied: Floats) -> bool:
 
 
 @bare(error_model="numpy")
-def rate(
-    i: int, constants: Constants, t: float, inside: float, own: Floats, applied: Floats, out: Floats, power: Floats
-) -> None:
+def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, applied: Floats, out: Floats, power: Floats) -> None:
     """d(own)/dt, eqs. (1), (2), and the train's powers [W]: see ``signals.Plant``.
 
     Faults and noise act on the force, so they are part of traction and braking power.

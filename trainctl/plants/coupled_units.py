@@ -136,9 +136,7 @@ def limit(i: int, constants: Constants, own: Floats, applied: Floats) -> bool:
 
 
 @njit(cache=True)
-def rate(
-    i: int, constants: Constants, t: float, inside: float, own: Floats, applied: Floats, out: Floats, power: Floats
-) -> None:
+def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, applied: Floats, out: Floats, power: Floats) -> None:
     """Write speed and acceleration of every unit of train ``i`` into ``out``, the train's powers into ``power``: eqs. (1)-(4).
 
     Parameters
