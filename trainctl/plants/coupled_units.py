@@ -21,9 +21,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from pydantic import Field
 
+from trainctl.plants.integrate import bare
 from trainctl.signals import GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Table
 
 STATES = 2
@@ -87,13 +87,13 @@ def constants(
     return Constants(consists.first, np.ascontiguousarray(units, dtype=np.float64), slopes)
 
 
-@njit(cache=True, inline="always")
+@bare(error_model="numpy", inline="always")
 def running_resistance(v: float, c0: float, c1: float, c2: float) -> float:
     """Specific running resistance [N/kg], Davis form: eq. (3), but zero at standstill."""
     return c0 + (c1 + c2 * v) * v if v > 0.0 else 0.0
 
 
-@njit(cache=True)
+@bare(error_model="numpy")
 def slope_at(x: float, gradient: Floats) -> float:
     """Rise / run at position ``x``."""
     if len(gradient) == 0:
@@ -108,13 +108,13 @@ def slope_at(x: float, gradient: Floats) -> float:
     return gradient[low, 1]  # type: ignore[no-any-return]
 
 
-@njit(cache=True, inline="always")
+@bare(error_model="numpy", inline="always")
 def available(v: float, force: float, power: float) -> float:
     """Largest force at speed ``v`` [N] of a unit limited by ``force`` [N] and ``power`` [W]."""
     return power / v if v > 0.0 and v * force > power else force
 
 
-@njit(cache=True)
+@bare(error_model="numpy")
 def limit(i: int, constants: Constants, own: Floats, applied: Floats) -> bool:
     """Clip the forces of train ``i`` to force and power limits of its units, in place; True if one acted."""
     a = constants.first[i]
@@ -123,19 +123,17 @@ def limit(i: int, constants: Constants, own: Floats, applied: Floats) -> bool:
     for j in range(len(applied)):
         v, u = own[j, SPEED], applied[j]
         if u > 0.0:
-            most = available(v, units[a + j, TRACTION], units[a + j, TRACTION_POWER])
-            if u > most:
-                applied[j] = most
-                acted = acted or u > most * (1.0 + 1e-9)  # a force meant to be just the limit is not cut
+            force, power, sign = units[a + j, TRACTION], units[a + j, TRACTION_POWER], 1.0
         else:
-            most = available(v, units[a + j, BRAKING], units[a + j, BRAKING_POWER])
-            if -u > most:
-                applied[j] = -most
-                acted = acted or -u > most * (1.0 + 1e-9)
+            force, power, sign = units[a + j, BRAKING], units[a + j, BRAKING_POWER], -1.0
+        if sign * u > force or sign * u * v > power:  # a division only where a limit acts
+            most = available(v, force, power)
+            applied[j] = sign * most
+            acted = acted or sign * u > most * (1.0 + 1e-9)  # a force meant to be just the limit is not cut
     return acted
 
 
-@njit(cache=True)
+@bare(error_model="numpy")
 def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, applied: Floats, out: Floats, power: Floats) -> None:
     """Write speed and acceleration of every unit of train ``i`` into ``out``, the train's powers into ``power``: eqs. (1)-(4).
 

@@ -19,7 +19,6 @@ from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from trainctl.plants import coupled_units
 from trainctl.plants.coupled_units import (
@@ -37,6 +36,7 @@ from trainctl.plants.coupled_units import (
     running_resistance,
     slope_at,
 )
+from trainctl.plants.integrate import bare
 from trainctl.signals import GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Links
 
 CLOCK: Literal["continuous"] = "continuous"
@@ -63,7 +63,7 @@ def constants(params: coupled_units.Params, consists: Consists, gradient: Floats
     return Constants(first, units, slopes, held, params.in_train_stiffness_per_s2, params.in_train_damping_per_s)
 
 
-@njit(cache=True)
+@bare(error_model="numpy")
 def demand(
     i: int, constants: Constants, leader: Floats, age: float, slot: float, own: Floats, estimate: Floats, correction: Floats,
     desired: Floats, heard: Floats, out: Floats,
@@ -86,12 +86,16 @@ def demand(
             load += GRAVITY * slope_at(own[j, POSITION], gradient)
         base, extra = units[row, INERTIA] * a_i + m * load, pull - f
         out[j] = base + extra
+        # A division only where the sum of both would leave a limit.
         if extra > 0.0:
-            room = available(v, units[row, TRACTION], units[row, TRACTION_POWER]) - base
+            force, power, sign = units[row, TRACTION], units[row, TRACTION_POWER], 1.0
         else:
-            room = available(v, units[row, BRAKING], units[row, BRAKING_POWER]) + base
-        if abs(extra) > max(room, 0.0):
-            scale = min(scale, max(room, 0.0) / abs(extra))
+            force, power, sign = units[row, BRAKING], units[row, BRAKING_POWER], -1.0
+        wanted = sign * (base + extra)
+        if wanted > force or wanted * v > power:
+            room = available(v, force, power) - sign * base
+            if abs(extra) > max(room, 0.0):
+                scale = min(scale, max(room, 0.0) / abs(extra))
         pull = f
     if scale < 1.0:
         for j in range(last):
@@ -100,7 +104,7 @@ def demand(
             out[j + 1] -= f
 
 
-@njit(cache=True, inline="always")
+@bare(error_model="numpy", inline="always")
 def pair(constants: Constants, row: int, own: Floats, j: int) -> float:
     """Force [N] the active part of the coupler behind unit ``j`` pulls its two units together with."""
     e = own[j, POSITION] - own[j + 1, POSITION] - constants.units[row, LENGTH]
@@ -109,14 +113,14 @@ def pair(constants: Constants, row: int, own: Floats, j: int) -> float:
     return float(lighter * (constants.stiffness * e + constants.damping * de))
 
 
-@njit(cache=True)
+@bare(error_model="numpy")
 def message(
     i: int, constants: Constants, leader: Floats, slot: float, own: Floats, estimate: Floats, estimate_rate: Floats, out: Floats
 ) -> None:
     """Nothing to send: trains talk in the sampled law."""
 
 
-@njit(cache=True)
+@bare(error_model="numpy")
 def watch(i: int, constants: Constants, leader: Floats, first: Ints, own: Floats, links: Links, out: Floats) -> None:
     """Nothing to watch here."""
 
