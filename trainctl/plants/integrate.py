@@ -179,17 +179,17 @@ def widen(low, high, k, value):  # type: ignore[no-untyped-def]
 @bare(inline="always")
 def along(out, base, factor, direction):  # type: ignore[no-untyped-def]
     """``out = base + factor * direction`` for tables, without temporaries."""
-    for r in range(out.shape[0]):
-        for c in range(out.shape[1]):
-            out[r, c] = base[r, c] + factor * direction[r, c]
+    o, b, d = out.reshape(out.size), base.reshape(base.size), direction.reshape(direction.size)  # one loop, so that it vectorises
+    for k in range(o.size):
+        o[k] = b[k] + factor * d[k]
 
 
 @bare(inline="always")
 def copy(out, table):  # type: ignore[no-untyped-def]
     """``out = table``."""
-    for r in range(out.shape[0]):
-        for c in range(out.shape[1]):
-            out[r, c] = table[r, c]
+    o, b = out.reshape(out.size), table.reshape(table.size)
+    for k in range(o.size):
+        o[k] = b[k]
 
 
 @bare()
