@@ -7,10 +7,11 @@ from pathlib import Path
 from sumo_net.build import build
 from sumo_net.layout import Gradient
 from sumo_net.line import Line, LineCrossover
+from sumo_net.rails import Rails
 from sumo_net.spec import Crossover, LineError, LineSpec, RegularCrossovers, parse_spec, read_spec
 
 __all__ = [
-    "Crossover", "Gradient", "Line", "LineCrossover", "LineError", "LineSpec", "RegularCrossovers",
+    "Crossover", "Gradient", "Line", "LineCrossover", "LineError", "LineSpec", "Rails", "RegularCrossovers",
     "build", "parse_spec", "read_spec", "shipped",
 ]  # fmt: skip
 

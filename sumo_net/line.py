@@ -12,18 +12,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
-from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sumo_net.layout import Floats, Gradient, edges, gradient
+from sumo_net.netfile import RAIL, NetEdge, NetFile, read_net
 from sumo_net.spec import LineError, LineSpec, text
 
 Ints = NDArray[np.int64]
-
-#: Vehicle classes that make an edge a railway.
-_RAIL = frozenset(("rail", "rail_electric", "rail_fast", "rail_urban", "tram", "subway", "cable_car"))
 
 
 class LineCrossover(NamedTuple):
@@ -84,7 +81,7 @@ class Line:
         LineError
             If there is no such file, or it is not a net of ours.
         """
-        return _line(_rail_edges(Path(path)), str(path))
+        return line_of(rail_edges(read_net(Path(path)), path), str(path))
 
     @cached_property
     def index(self) -> dict[str, int]:
@@ -188,70 +185,26 @@ def _some(names: list[str]) -> str:
     return ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "") if names else "none"
 
 
-class _NetEdge:
-    """What a net file says of one rail edge."""
-
-    def __init__(self, attributes: dict[str, str]) -> None:
-        self.attributes = attributes
-        self.lane: dict[str, str] = {}
-        self.params: dict[str, str] = {}
-
-
-def _rail_edges(path: Path) -> list[_NetEdge]:
+def rail_edges(net: NetFile, path: str | Path) -> list[NetEdge]:
     """The rail edges of a net file, in its order. Internal edges are left out: nets built here have none."""
-    found: list[_NetEdge] = []
-    current: _NetEdge | None = None
-    depth = 0
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal current, depth
-        depth += 1
-        if depth == 1 and tag != "net":
-            raise LineError([f"{path}: not a SUMO net: its root element is <{tag}>, not <net>"])
-        if depth == 2:
-            current = _NetEdge(attributes) if tag == "edge" and attributes.get("function", "normal") == "normal" else None
-        elif current is not None and depth == 3:
-            if tag == "lane" and not current.lane:
-                current.lane = attributes
-            elif tag == "param":
-                current.params[attributes.get("key", "")] = attributes.get("value", "")
-
-    def end(tag: str) -> None:
-        nonlocal depth
-        if depth == 2 and tag == "edge" and current is not None and _RAIL & set(current.lane.get("allow", "").split()):
-            found.append(current)
-        depth -= 1
-
-    def refuse(*_: object) -> None:
-        raise LineError([f"{path}: not a SUMO net: it declares XML entities or a document type"])
-
-    parser = expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
-    try:
-        with path.open("rb") as file:
-            parser.ParseFile(file)
-    except FileNotFoundError:
-        raise LineError([f"{path}: no such net file"]) from None
-    except OSError as error:
-        raise LineError([f"{path}: cannot be read: {error.strerror}"]) from None
-    except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: an encoding that is none
-        raise LineError([f"{path}: not XML: {error}"]) from None
+    normal = (e for e in net.edges if e.attributes.get("function", "normal") == "normal" and e.lanes)
+    found = [e for e in normal if RAIL & set(e.lanes[0].get("allow", "").split())]
     if not found:
         raise LineError([f"{path}: has no rail edges"])
     return found
 
 
-def _line(found: list[_NetEdge], file: str) -> Line:
+def line_of(found: list[NetEdge], file: str) -> Line:
+    """The line its rail edges describe, if ``sumo_net`` built them."""
     if not any("track" in e.params for e in found):
         rule = "so far only nets built by sumo_net are supported"
         raise LineError([f"{file}: none of its {len(found)} rail edges has a 'track' parameter: {rule}"])
     mistakes, rows = [], []
     for e in found:
-        name = e.attributes.get("id", "")
+        name, lane = e.attributes.get("id", ""), e.lanes[0]
         try:
-            start, length, speed = float(e.attributes.get("distance", 0.0)), float(e.lane["length"]), float(e.lane["speed"])
-            side = float(e.lane["shape"].split()[0].split(",")[1])
+            start, length, speed = float(e.attributes.get("distance", 0.0)), float(lane["length"]), float(lane["speed"])
+            side = float(lane["shape"].split()[0].split(",")[1])
             slopes = [(float(at), float(slope)) for at, slope in (piece.split(":") for piece in e.params.get("slope", "").split())]
             over, leaves = e.params.get("crossover"), e.params.get("from_track", "")
             rows.append((name, e.params["track"], start, length, speed, side, slopes, over, leaves))

@@ -1,0 +1,90 @@
+"""What a SUMO net file says of edges, connections and junctions, as text; the meaning is with who reads it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+from xml.parsers import expat
+
+from sumo_net.spec import LineError
+
+#: Vehicle classes that make an edge a railway.
+RAIL = frozenset(("rail", "rail_electric", "rail_fast", "rail_urban", "tram", "subway", "cable_car"))
+
+
+class NetEdge(NamedTuple):
+    """An edge of any kind, with its lanes by index."""
+
+    attributes: dict[str, str]
+    lanes: list[dict[str, str]]
+    params: dict[str, str]
+
+
+class NetJunction(NamedTuple):
+    """A junction and the rows of its right of way."""
+
+    attributes: dict[str, str]
+    requests: list[dict[str, str]]
+
+
+class NetFile(NamedTuple):
+    """A net file, in its order."""
+
+    edges: list[NetEdge]
+    connections: list[dict[str, str]]
+    junctions: list[NetJunction]
+
+
+def read_net(path: Path) -> NetFile:
+    """The net in a file.
+
+    Raises
+    ------
+    LineError
+        If there is no such file, it cannot be read, or it is not a net.
+    """
+    net = NetFile([], [], [])
+    inside: NetEdge | NetJunction | None = None
+    depth = 0
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal inside, depth
+        depth += 1
+        if depth == 2:
+            inside = None
+            if tag == "connection":
+                net.connections.append(attributes)
+            elif tag == "edge":
+                net.edges.append(inside := NetEdge(attributes, [], {}))
+            elif tag == "junction":
+                net.junctions.append(inside := NetJunction(attributes, []))
+        elif depth == 3 and inside is not None:
+            if tag == "lane" and isinstance(inside, NetEdge):
+                inside.lanes.append(attributes)
+            elif tag == "param" and isinstance(inside, NetEdge):
+                inside.params[attributes.get("key", "")] = attributes.get("value", "")
+            elif tag == "request" and isinstance(inside, NetJunction):
+                inside.requests.append(attributes)
+        elif depth == 1 and tag != "net":
+            raise LineError([f"{path}: not a SUMO net: its root element is <{tag}>, not <net>"])
+
+    def end(_: str) -> None:
+        nonlocal depth
+        depth -= 1
+
+    def refuse(*_: object) -> None:
+        raise LineError([f"{path}: not a SUMO net: it declares XML entities or a document type"])
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
+    try:
+        with path.open("rb") as file:
+            parser.ParseFile(file)
+    except FileNotFoundError:
+        raise LineError([f"{path}: no such net file"]) from None
+    except OSError as error:
+        raise LineError([f"{path}: cannot be read: {error.strerror}"]) from None
+    except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: an encoding that is none
+        raise LineError([f"{path}: not XML: {error}"]) from None
+    return net
