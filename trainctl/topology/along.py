@@ -1,0 +1,467 @@
+"""Neighbours along the ways trains take: who is next ahead, and what stands bodily in the way.
+
+A train's way is the list of edges it runs over from its departure until it leaves the net. On every edge its way is compared with
+the trains that stand there (sorted by how far their fronts are past the start of the edge), on every edge where tracks join also
+with the trains that come over another track (sorted by their distance to that edge). Spacings are front to front, room is front to
+body.
+
+A train that reverses begins a new way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numba import njit
+
+from trainctl.kernels import keep_by_sources
+from trainctl.signals import Bools, Floats, Ints
+
+keep_by_sources()  # before anything below is decorated
+
+#: Rank of a train whose turn at a join is not decided.
+UNDECIDED = np.iinfo(np.int64).max
+
+
+class Ways(NamedTuple):
+    """What every train will run over, and has run over since its departure; train i has the rows first[i]:first[i + 1]."""
+
+    first: Ints  # (n + 1,)
+    edge: Ints  # (W,) edge numbers in running order, internal edges included
+    begin: Floats  # (W,) m from the beginning of the way to the start of that edge
+
+
+class Railway(Protocol):
+    """What is read of a net: lengths, what joins, opposite directions of one track, level crossings of tracks; E edges."""
+
+    @property
+    def length_m(self) -> Floats:
+        """Length of every edge [m], shape (E,)."""
+
+    @property
+    def before(self) -> Sequence[Sequence[int]]:
+        """Edges that lead into each edge."""
+
+    @property
+    def twin(self) -> Ints:
+        """The same track in the other direction, shape (E,); -1: none."""
+
+    @property
+    def crossing(self) -> Sequence[Sequence[int]]:
+        """Edges that physically cross each edge."""
+
+
+class Net(NamedTuple):
+    """A railway as arrays; edge e is crossed by cross[cross_first[e]:cross_first[e + 1]]."""
+
+    length: Floats  # (E,) m
+    joins: Bools  # (E,) two or more edges lead into it
+    twin: Ints  # (E,) -1: none
+    cross_first: Ints  # (E + 1,)
+    cross: Ints  # (C,)
+
+
+class Order(NamedTuple):
+    """Turns decided at joins, see ``claims``: train[q] is number rank[q] over edge[q]."""
+
+    edge: Ints  # (Q,)
+    train: Ints  # (Q,)
+    rank: Ints  # (Q,)
+
+
+class Places(NamedTuple):
+    """Where all trains are, sorted per edge. Build it with ``places``; P pieces of trains on edges, R approaches to joins."""
+
+    ways: Ways
+    net: Net
+    row: Ints  # (n,)
+    s: Floats  # (n,) m
+    length: Floats  # (n,) m
+    longest: float  # m
+    horizon: float  # m
+    piece_first: Ints  # (E + 1,) pieces on edge e: piece_first[e]:piece_first[e + 1], by depth
+    piece_train: Ints  # (P,)
+    depth: Floats  # (P,) m from the start of the edge to the front of the train, more than its length if the front has left it
+    front: Ints  # (n,) piece with the front of train i, -1 if it is not on the net
+    own_first: Ints  # (n + 1,) approaches of train i: own[own_first[i]:own_first[i + 1]], nearest first
+    own: Ints  # (R,) places of them in what follows
+    join_first: Ints  # (E + 1,) approaches to edge e, first to pass first
+    join_train: Ints  # (R,)
+    join_row: Ints  # (R,) row of that edge in the way of the train
+    rank: Ints  # (R,) UNDECIDED: by distance
+
+
+class Ahead(NamedTuple):
+    """The next train ahead of each."""
+
+    train: Ints  # (n,) -1: none
+    spacing: Floats  # (n,) m, front to front; inf: none
+
+
+class Obstacles(NamedTuple):
+    """What stands in the way of each train."""
+
+    room: Floats  # (n,) m from the front to it, negative: overlapping; inf: none
+    train: Ints  # (n,) whose body it is, -1: none
+    sense: Ints  # (n,) 1: it runs the same way, -1: it comes the other way, 0: across, or a join to be kept clear
+
+
+def net(railway: Railway) -> Net:
+    """Arrays of a railway, to be made once per run."""
+    crossing = [sorted(c) for c in railway.crossing]
+    return Net(
+        length=np.ascontiguousarray(railway.length_m, np.float64),
+        joins=np.array([len(b) > 1 for b in railway.before], bool),
+        twin=np.ascontiguousarray(railway.twin, np.int64),
+        cross_first=np.concatenate([[0], np.cumsum([len(c) for c in crossing], dtype=np.int64)]).astype(np.int64),
+        cross=np.array([e for c in crossing for e in c], np.int64),
+    )
+
+
+def ways(edges: Sequence[Sequence[int]], length: Floats) -> Ways:
+    """Ways over these edge numbers, one sequence per train; ``length`` (E,) [m]."""
+    counts = [len(e) for e in edges]
+    edge = np.array([e for way in edges for e in way], np.int64)
+    first = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)]).astype(np.int64)
+    begin = np.zeros(len(edge))
+    for a, b in pairwise(first.tolist()):
+        begin[a + 1 : b] = np.cumsum(length[edge[a : b - 1]]) if b > a else 0.0
+    return Ways(first, edge, begin)
+
+
+def places(
+    ways: Ways, net: Net, row: Ints, s: Floats, length: Floats, present: Bools, horizon: float, order: Order | None = None
+) -> Places:
+    """Sort the trains per edge, once per instant for ``ahead`` and ``obstacles``.
+
+    Parameters
+    ----------
+    ways : Ways
+        Rows of all n trains.
+    net : Net
+        From ``net``.
+    row : ndarray, shape (n,)
+        Row in ``ways.edge`` of the edge the front is on; not read where the train is not present.
+    s : ndarray, shape (n,)
+        Front, from the beginning of the way [m].
+    length : ndarray, shape (n,)
+        Train lengths [m].
+    present : ndarray, shape (n,)
+        Who is on the net.
+    horizon : float
+        How far ahead is looked [m]; trains farther than this from a join do not count as approaching it.
+    order : Order, optional
+        Turns that are decided: they go before undecided trains, whatever the distances.
+
+    Returns
+    -------
+    Places
+        Input of ``ahead`` and ``obstacles``.
+    """
+    edges = len(net.length)
+    train, at = _pieces(ways, row, s, length, present)
+    depth = s[train] - ways.begin[at]
+    by_depth = np.lexsort((-train, depth, ways.edge[at]))
+    front = np.full(len(row), -1, np.int64)
+    standing = np.flatnonzero(at[by_depth] == row[train[by_depth]])
+    front[train[by_depth[standing]]] = standing
+    own_first, comer, join_row = _approaches(ways, net.joins, row, s, present, horizon)
+    join = ways.edge[join_row]
+    rank = np.full(len(comer), UNDECIDED, np.int64)
+    if order is not None:
+        _decided(order, own_first, join, rank)
+    by_turn = np.lexsort((comer, ways.begin[join_row] - s[comer], rank, join))
+    own = np.empty(len(comer), np.int64)
+    own[by_turn] = np.arange(len(comer))
+    return Places(
+        ways=ways, net=net, row=row, s=s, length=length,
+        longest=float(length[present].max(initial=0.0)), horizon=float(horizon),
+        piece_first=_starts(ways.edge[at], edges), piece_train=train[by_depth], depth=depth[by_depth], front=front,
+        own_first=own_first, own=own, join_first=_starts(join, edges), join_train=comer[by_turn],
+        join_row=join_row[by_turn], rank=rank[by_turn],
+    )  # fmt: skip
+
+
+def ahead(places: Places) -> Ahead:
+    """Find the next train ahead on the way each train will take.
+
+    Parameters
+    ----------
+    places : Places
+        From ``places``.
+
+    Returns
+    -------
+    Ahead
+        ``train`` (n,) and ``spacing`` (n,) [m], front to front along the way; -1 and inf where there is none within the horizon,
+        and for trains that are not on the net.
+
+    Notes
+    -----
+    Ahead is a train whose front is on the way, also if its own way branches off later, and one that still comes over another track
+    and joins: its distance to the edge where it joins is smaller (ties by number), or its turn was decided to be earlier. Its
+    spacing is the difference of the distances, so it can be negative where the turn was decided against the distances. Two trains
+    of which one stands on the way of the other before they part and join again keep the order they stand in.
+
+    The train behind is the inverse where it is unique, see ``behind``: two trains may have the same one ahead, on two tracks before
+    a join or where one ahead of both will branch off.
+    """
+    train, spacing = np.full(len(places.row), -1, np.int64), np.full(len(places.row), np.inf)
+    _ahead(places, train, spacing)
+    return Ahead(train, spacing)
+
+
+def behind(ahead: Ahead) -> Ahead:
+    """Find the train behind each: the nearest of those that have it ahead, ties by number."""
+    train, spacing = np.full(len(ahead.train), -1, np.int64), np.full(len(ahead.train), np.inf)
+    follower = np.flatnonzero(ahead.train >= 0)
+    far_first = follower[np.lexsort((-follower, -ahead.spacing[follower]))]
+    train[ahead.train[far_first]] = far_first  # the last write stays: the nearest
+    spacing[ahead.train[far_first]] = ahead.spacing[far_first]
+    return Ahead(train, spacing)
+
+
+def obstacles(places: Places, virtual: bool = True) -> Obstacles:
+    """Find the nearest occupied point on the way of each train.
+
+    Parameters
+    ----------
+    places : Places
+        From ``places``.
+    virtual : bool
+        A train that comes over another track and is ahead, see ``ahead``. True: its rear is taken to be its length behind its
+        front on the own way, from the horizon until it has wholly joined, so trains sort themselves in before the join. False:
+        only what is there counts: the join is to be kept clear (room to the start of that edge, sense 0), then the body from there.
+
+    Returns
+    -------
+    Obstacles
+        ``room`` (n,) [m], ``train`` (n,) and ``sense`` (n,): the speed of the body along the own way is ``sense`` times the speed
+        of that train, 0 for one across.
+
+    Notes
+    -----
+    Bodies reach from the front back over the way they came; where a way began less than a length ago the train hangs out behind
+    the beginning. Bodies on the twin of an edge are mirrored. A body on an edge that crosses one of the way blocks it as a whole;
+    a train that already is on a blocked edge is held only by trains that are deeper in. A train is no obstacle to itself.
+    """
+    n = len(places.row)
+    room, train, sense = np.full(n, np.inf), np.full(n, -1, np.int64), np.zeros(n, np.int64)
+    _obstacles(places, virtual, room, train, sense)
+    return Obstacles(room, train, sense)
+
+
+def _starts(edge: Ints, edges: int) -> Ints:
+    """Where the entries of every edge begin in a list sorted by edge, shape (E + 1,)."""
+    return np.concatenate([[0], np.cumsum(np.bincount(edge, minlength=edges))]).astype(np.int64)
+
+
+@njit(cache=True)
+def _pieces(ways: Ways, row: Ints, s: Floats, length: Floats, present: Bools) -> tuple[Ints, Ints]:
+    """Every train on every edge its body is on: train and row, shape (P,) each."""
+    count = 0
+    for again in range(2):
+        if again:
+            train, at = np.empty(count, np.int64), np.empty(count, np.int64)
+        count = 0
+        for i in range(len(row)):
+            if not present[i]:
+                continue
+            k = row[i]
+            while True:
+                if again:
+                    train[count], at[count] = i, k
+                count += 1
+                if k == ways.first[i] or ways.begin[k] <= s[i] - length[i]:
+                    break
+                k -= 1
+    return train, at
+
+
+@njit(cache=True)
+def _approaches(ways: Ways, joins: Bools, row: Ints, s: Floats, present: Bools, horizon: float) -> tuple[Ints, Ints, Ints]:
+    """Joins ahead of every train within the horizon: first (n + 1,), then train and row, shape (R,) each."""
+    first = np.zeros(len(row) + 1, np.int64)
+    count = 0
+    for again in range(2):
+        if again:
+            train, at = np.empty(count, np.int64), np.empty(count, np.int64)
+        count = 0
+        for i in range(len(row)):
+            if present[i]:
+                for k in range(row[i] + 1, ways.first[i + 1]):
+                    if ways.begin[k] - s[i] > horizon:
+                        break
+                    if joins[ways.edge[k]]:
+                        if again:
+                            train[count], at[count] = i, k
+                        count += 1
+            first[i + 1] = count
+    return first, train, at
+
+
+@njit(cache=True)
+def _decided(order: Order, own_first: Ints, join: Ints, rank: Ints) -> None:
+    """Write the turns into ``rank`` (R,): of a train that passes an edge more than once, they mean the first time."""
+    for q in range(len(order.edge)):
+        i = order.train[q]
+        for r in range(own_first[i], own_first[i + 1]):
+            if join[r] == order.edge[q]:
+                rank[r] = order.rank[q]
+                break
+
+
+@njit(cache=True)
+def _comes_over_another_track(places: Places, i: int, k: int, j: int, m: int) -> bool:
+    """Whether the ways of ``i`` and ``j`` join at their rows k and m, neither front standing on the way of the other before."""
+    edge, row = places.ways.edge, places.row
+    if edge[k - 1] == edge[m - 1]:
+        return False
+    for r in range(row[i], k):
+        if edge[r] == edge[row[j]]:
+            return False
+    for r in range(row[j], m):  # noqa: SIM110, compiled
+        if edge[r] == edge[row[i]]:
+            return False
+    return True
+
+
+@njit(cache=True)
+def _joining(places: Places, i: int, best: float, lengths: bool) -> tuple[int, float, float]:
+    """Nearest train that comes over another track and is ahead of ``i``, nearer than ``best``.
+
+    Returns the train or -1, its spacing (less its length, if ``lengths``) [m] and the distance of ``i`` to where it joins [m].
+    """
+    begin, s = places.ways.begin, places.s
+    slack = places.longest if lengths else 0.0
+    found, joins_at = -1, np.inf
+    for q in range(places.own_first[i], places.own_first[i + 1]):
+        own = places.own[q]
+        k = places.join_row[own]
+        distance = begin[k] - s[i]
+        first = places.join_first[places.ways.edge[k]]
+        decided = first
+        while decided < own and places.rank[decided] != UNDECIDED:
+            decided += 1
+        # Decided turns come first and are few; the undecided ones before the own are in order of distance, from near to far.
+        p = own - 1
+        while p >= first:
+            j, m = places.join_train[p], places.join_row[p]
+            spacing = distance - (begin[m] - s[j])
+            if p >= decided and spacing - slack >= best:
+                p = decided - 1
+                continue
+            value = spacing - places.length[j] if lengths else spacing
+            if j != i and value < best and _comes_over_another_track(places, i, k, j, m):
+                found, best, joins_at = j, value, distance
+            p -= 1
+    return found, best, joins_at
+
+
+@njit(cache=True)
+def _ahead(places: Places, train: Ints, spacing: Floats) -> None:
+    ways, s = places.ways, places.s
+    for i in range(len(train)):
+        if places.front[i] < 0:
+            continue
+        found, best = -1, np.inf
+        for k in range(places.row[i], ways.first[i + 1]):
+            away = ways.begin[k] - s[i]
+            if away > places.horizon:
+                break
+            e = ways.edge[k]
+            p = places.front[i] + 1 if k == places.row[i] else places.piece_first[e]
+            if p < places.piece_first[e + 1] and places.piece_train[p] == i:
+                p += 1
+            if p < places.piece_first[e + 1]:
+                j = places.piece_train[p]
+                if ways.edge[places.row[j]] == e and places.front[j] == p:  # not a tail whose front has left the edge
+                    if away + places.depth[p] <= places.horizon:
+                        found, best = j, away + places.depth[p]
+                    break
+        j, value, _ = _joining(places, i, best, False)
+        if j >= 0:
+            found, best = j, value
+        train[i], spacing[i] = found, best
+
+
+@njit(cache=True)
+def _obstacles(places: Places, virtual: bool, room: Floats, train: Ints, sense: Ints) -> None:
+    ways, net, s = places.ways, places.net, places.s
+    for i in range(len(room)):
+        if places.front[i] < 0:
+            continue
+        found, best, way = -1, np.inf, 0
+        inside = s[i] - ways.begin[places.row[i]]
+        for k in range(places.row[i], ways.first[i + 1]):
+            away = ways.begin[k] - s[i]
+            if away > places.horizon or away - places.longest >= best:
+                break
+            e = ways.edge[k]
+            here = k == places.row[i]
+            # The same way: by depth, so once the longest train could not come nearer none can.
+            p = places.front[i] + 1 if here else places.piece_first[e]
+            while p < places.piece_first[e + 1] and away + places.depth[p] - places.longest < best:
+                j = places.piece_train[p]
+                rear = places.depth[p] - places.length[j]
+                value = away + (rear if virtual else max(rear, 0.0))
+                if j != i and value < best:
+                    found, best, way = j, value, 1
+                p += 1
+            # The other way on the same track: the deepest is nearest.
+            t = net.twin[e]
+            if t >= 0:
+                for p in range(places.piece_first[t + 1] - 1, places.piece_first[t] - 1, -1):
+                    j = places.piece_train[p]
+                    rear = max(places.depth[p] - places.length[j], 0.0)
+                    if j == i or (here and net.length[e] - rear <= inside):
+                        continue
+                    value = away + net.length[e] - min(places.depth[p], net.length[e])
+                    if value < best:
+                        found, best, way = j, value, -1
+                    break
+            for q in range(net.cross_first[e], net.cross_first[e + 1]):
+                c = net.cross[q]
+                for p in range(places.piece_first[c + 1] - 1, places.piece_first[c] - 1, -1):
+                    j = places.piece_train[p]
+                    if j == i or (here and not deeper(places.depth[p], j, inside, i)):
+                        continue
+                    if away < best:
+                        found, best, way = j, away, 0
+                    break
+        if best > places.horizon:
+            found, best, way = -1, np.inf, 0
+        if virtual:
+            j, value, _ = _joining(places, i, best, True)
+            if j >= 0:
+                found, best, way = j, value, 1
+        else:
+            j, at = _join_to_keep_clear(places, i, best)
+            if j >= 0:
+                found, best, way = j, at, 0
+        room[i], train[i], sense[i] = best, found, way
+
+
+@njit(cache=True)
+def deeper(depth: float, j: int, inside: float, i: int) -> bool:
+    """Whether train ``j`` is farther in than train ``i``, ties by number."""
+    return depth > inside or (depth == inside and j < i)
+
+
+@njit(cache=True)
+def _join_to_keep_clear(places: Places, i: int, best: float) -> tuple[int, float]:
+    """Nearest join ahead of ``i`` that a train over another track passes first: that train or -1, and the distance [m]."""
+    for q in range(places.own_first[i], places.own_first[i + 1]):
+        own = places.own[q]
+        k = places.join_row[own]
+        distance = places.ways.begin[k] - places.s[i]
+        if distance >= best:
+            break
+        for p in range(own - 1, places.join_first[places.ways.edge[k]] - 1, -1):
+            j, m = places.join_train[p], places.join_row[p]
+            if j != i and _comes_over_another_track(places, i, k, j, m):
+                return j, distance
+    return -1, best
