@@ -121,9 +121,10 @@ def _nodes(spec: LineSpec, pieces: list[Edge], slopes: Gradient) -> str:
             places[_node(e.track, e.end_m)] = (e.end_m, e.track)
     x, z = _in_space(np.array([at for at, _ in places.values()]), slopes)
     y = _lateral(spec)
+    signal = dict.fromkeys(spec.signals(), ' type="rail_signal"')
     lines = [
-        f'    <node id="{node}" x="{_number(x[k])}" y="{_number(y[track])}" z="{_number(z[k])}" radius="0"/>'
-        for k, (node, (_, track)) in enumerate(places.items())
+        f'    <node id="{node}" x="{_number(x[k])}" y="{_number(y[track])}" z="{_number(z[k])}" radius="0"{signal.get(at, "")}/>'
+        for k, (node, (at, track)) in enumerate(places.items())
     ]
     return "\n".join(["<nodes>", *lines, "</nodes>", ""])
 

@@ -134,6 +134,9 @@ class LineSpec(_Strict):
     length_m: float = Field(gt=0, le=1e7, description="Length of the line [m].")
     start_m: float = Field(0.0, ge=0, le=1e7, description="Kilometrage of its beginning [m], not negative.")
     max_edge_m: float = Field(5000.0, ge=10, description="No edge of a track is longer than this [m].")
+    signals_m: float | None = Field(
+        None, ge=10, description="Distance of the rail signals of every track [m], the first this far from start_m; default none."
+    )
     speed: Annotated[tuple[SpeedFrom, ...], Field(strict=False), AfterValidator(_not_empty)] = Field(
         description="Speed limit: pairs [from_m, speed_mps], the first at start_m."
     )
@@ -169,9 +172,17 @@ class LineSpec(_Strict):
                 yield Crossover.model_validate({"from": here, "to": there} | place)
             k += 1
 
+    def signals(self) -> list[float]:
+        """Kilometrage of the signals [m]: edges end there, on every track."""
+        if self.signals_m is None:
+            return []
+        last = math.floor((self.end_m - SHORTEST_EDGE_M - self.begin_m) / self.signals_m + 1e-9)
+        return [rounded(self.begin_m + k * self.signals_m) for k in range(1, last + 1)]
+
     def cuts(self) -> dict[str, dict[float, str]]:
-        """Where each track must be cut into edges, and why: ends of the line, speed changes, both ends of crossovers."""
-        common = {rounded(at): f"the speed change at {text(at)} m" for at, _ in self.speed}
+        """Where each track must be cut into edges, and why: ends of the line, signals, speed changes, both ends of crossovers."""
+        common = {at: f"the signal at {text(at)} m" for at in self.signals()}
+        common |= {rounded(at): f"the speed change at {text(at)} m" for at, _ in self.speed}
         common |= {self.begin_m: "the beginning of the line", self.end_m: "the end of the line"}
         found = {track: dict(common) for track in self.tracks}
         for c in self.all_crossovers():
@@ -363,6 +374,8 @@ def _too_many(spec: LineSpec) -> list[str]:
     found = []
     if edges > MOST_EDGES:
         found.append(f"max_edge_m = {spec.max_edge_m:g}: cuts the line into {edges} edges, at most {MOST_EDGES}")
+    if spec.signals_m is not None and (blocks := len(spec.tracks) * math.ceil(spec.length_m / spec.signals_m)) > MOST_EDGES:
+        found.append(f"signals_m = {spec.signals_m:g}: cuts the line into {blocks} blocks, at most {MOST_EDGES}")
     if (r := spec.regular_crossovers) and (count := 2 * (len(spec.tracks) - 1) * spec.length_m / r.every_m) > MOST_EDGES:
         found.append(f"regular_crossovers.every_m = {r.every_m:g}: makes {count:.0f} crossovers, at most {MOST_EDGES}")
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import subprocess
 import sys
 import time
@@ -26,6 +27,7 @@ HILLY = {
         {"id": "on", "from": "right", "to": "left", "position_m": 6200.823456, "length_m": 200.0, "speed_mps": 40.0},
     ],
 }  # fmt: skip
+SIGNALLED = HILLY | {"name": "signalled", "signals_m": 1000.0}
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +38,7 @@ def three() -> LineSpec:
 @pytest.fixture(scope="module")
 def nets(tmp_path_factory, three) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("nets")
-    return {spec.name: build(spec, folder) for spec in (three, parse_spec(HILLY, "hilly.toml"))}
+    return {spec.name: build(spec, folder) for spec in (three, *(parse_spec(t, "") for t in (HILLY, SIGNALLED)))}
 
 
 Start = Callable[[Path, str, float, float], Callable[[], float]]
@@ -67,9 +69,9 @@ def start() -> Iterator[Start]:
     libsumo.close()
 
 
-@pytest.mark.parametrize("name", ["three_tracks", "hilly"])
+@pytest.mark.parametrize("name", ["three_tracks", "hilly", "signalled"])
 def test_the_net_gives_back_the_very_line_it_was_built_from(nets, three, name):
-    built = Line.of({"three_tracks": three, "hilly": parse_spec(HILLY, "hilly.toml")}[name])
+    built = Line.of({"three_tracks": three, "hilly": parse_spec(HILLY, ""), "signalled": parse_spec(SIGNALLED, "")}[name])
     read = Line.read(nets[name])
     for field in ("edges", "tracks", "crossovers", "track_ids", "begin_m", "end_m"):
         assert getattr(read, field) == getattr(built, field), field
@@ -90,7 +92,19 @@ def test_the_same_line_gives_the_same_bytes_and_nothing_else_is_left(nets, three
     assert "netconvert 1." in files[2].read_text()[:200]
 
 
-@pytest.mark.parametrize("name", ["three_tracks", "hilly"])
+def test_signals_stand_where_they_should_and_move_nothing(nets):
+    words = {name: nets[name].read_text() for name in ("hilly", "signalled")}
+    assert "rail_signal" not in words["hilly"]
+    standing = re.findall(r'<junction id="n(left|right)_([\d.]+)" type="rail_signal"', words["signalled"])
+    assert sorted(standing) == sorted((t, f"{250.5 + 1000.0 * k:g}") for t in ("left", "right") for k in range(1, 12))
+    with_, without = Line.read(nets["signalled"]), Line.read(nets["hilly"])
+    assert (with_.begin_m, with_.end_m, with_.crossovers) == (without.begin_m, without.end_m, without.crossovers)
+    for track, position in (("left", 251.0), ("left", 4000.5), ("right", 6201.5), ("right", 12250.0)):
+        places = [line.start_m[edge] + at for line in (with_, without) for edge, at in [line.locate(track, position)]]
+        assert places == pytest.approx([position, position], abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["three_tracks", "hilly", "signalled"])
 def test_sumo_opens_the_net_without_a_word(nets, name):
     program, environment = netconvert()
     done = subprocess.run(

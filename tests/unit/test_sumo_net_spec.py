@@ -49,6 +49,22 @@ def test_the_last_regular_crossover_lies_wholly_on_the_line():
     assert {c.position_m for c in spec.all_crossovers() if c.id is None} == {5000.0}
 
 
+def test_signals_stand_inside_the_line_only():
+    line = {"name": "plain", "tracks": ["a"], "start_m": 500.0, "speed": [[500, 10]], "signals_m": 2000.0}
+    assert parse_spec(line | {"length_m": 6000.0}, "f.toml").signals() == [2500.0, 4500.0]
+    assert parse_spec(line | {"length_m": 6001.0}, "f.toml").signals() == [2500.0, 4500.0, 6500.0]
+    assert parse_spec(line | {"length_m": 2000.0}, "f.toml").signals() == []
+
+
+def test_a_signal_too_close_to_a_switch_is_told():
+    assert mistakes(signals_m=6999.5) == [
+        "tracks = 1: the signal at 7999.5 m and the switch of over at 8000 m: must be one place or at least 1 m apart, not 0.5 m"
+    ]
+    assert mistakes(signals_m=5.0) == ["signals_m = 5.0: must be greater than or equal to 10"]
+    crowded = mistakes(signals_m=10.0, length_m=1e6, crossover=[], regular_crossovers=None)
+    assert crowded == ["signals_m = 10: cuts the line into 300000 blocks, at most 100000"]
+
+
 def test_defaults():
     spec = parse_spec({"name": "plain", "tracks": ["a"], "length_m": 10, "speed": [[0, 10]]}, "f.toml")
     assert (spec.start_m, spec.gradient, spec.all_crossovers()) == (0.0, (), [])
