@@ -35,6 +35,7 @@ from trainctl.plants.integrate import Extremes
 from trainctl.prepare import Prepared
 from trainctl.record.folder import FORMAT, installed
 from trainctl.signals import Demand, Floats, Ints, Links
+from trainctl.topology.ways import Ways
 from trainctl.world import Seen, Start, World
 
 if TYPE_CHECKING:
@@ -123,6 +124,15 @@ class Tape:
         """Give a train another route."""
         self.routes.append((self.steps, train, list(edges)))
         self.world.route(train, edges)
+
+    def insert(self, train: int, speed: float) -> None:
+        """Put a train on the net: not replayed, so runs in which trains come later have no checkpoints."""
+        self.world.insert(train, speed)
+
+    @property
+    def ways(self) -> Ways:
+        """Ways of all trains as they are now ordered."""
+        return self.world.ways
 
     def linked(self, links: Links, formation: Ints) -> None:
         """Who hears whom from now on."""

@@ -129,6 +129,8 @@ class Simulation:
                 length=p.consists.train_length(),
                 unit_length=[p.consists.length[a:b] for a, b in pairwise(first)],
                 routes=[line.route(t.track, t.position_m) for t in p.scenario.train],
+                present=np.ones(len(places), bool),
+                vclass=["rail"] * len(places),
             )
         )
 

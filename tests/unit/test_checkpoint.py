@@ -40,7 +40,7 @@ def line():
 def started(world, folder, saved=None):
     tape = Tape(world, folder, saved)
     one = np.zeros(2)
-    tape.start(Start(("a", "b"), one.astype(int), one, one, one, [one, one], [("e",), ("e",)]))
+    tape.start(Start(("a", "b"), one.astype(int), one, one, one, [one, one], [world.line.edges[:1]] * 2, one == 0, ["rail"] * 2))
     return tape
 
 

@@ -28,7 +28,7 @@ def row_of(p, t=0.0, watched=0, **changes):
     own = p.own.copy()
     heads = own[p.heads]
     given = {
-        "time": t, "seen": Seen(heads[:, POSITION].copy(), np.zeros(n, np.int64)), "track": p.start_track, "own": own,
+        "time": t, "seen": Seen(heads[:, POSITION].copy(), np.zeros(n, np.int64), np.zeros(n, np.int64), np.ones(n, bool)), "track": p.start_track, "own": own,
         "speed": heads[:, SPEED].copy(), "ahead": np.full(n, -1), "links": p.first_links,
         "motion": Motion(np.zeros(n), np.zeros(n), np.zeros(n, bool), np.zeros(n, bool), None, {}),
         "saturated": np.zeros(n, bool), "extremes": Extremes.fresh(n, len(own), watched), "disturbed": None,
@@ -78,7 +78,7 @@ def test_spacing_and_collision(units):
     alarms = Alarms(units)
     place = row_of(units).seen.position.copy()
     place[2] = place[3] + 300.0  # 420 m is the least, the train 320 m long
-    found = told(alarms, row_of(units, seen=Seen(place, np.zeros(6, np.int64))))
+    found = told(alarms, row_of(units, seen=Seen(place, np.zeros(6, np.int64), np.zeros(6, np.int64), np.ones(6, bool))))
     assert ("gap_m", "3-4", pytest.approx(-20.0), 0.0) in found
     assert ("spacing_lower_m", "3-4", pytest.approx(300.0), 420.0) in found
 

@@ -38,12 +38,21 @@ class Parts(NamedTuple):
     exchange: Callable[..., None]
 
 
+class Orders(NamedTuple):
+    """What is ordered from outside of the law over one simulator step. Arrays of length 0 order nothing."""
+
+    force: Floats  # (U,) N, instead of the law's demand; NaN leaves a train to its law
+    pace: Floats  # (n, 3) position [m], speed [m/s] and acceleration [m/s2] at ``since`` of each train's own reference
+    since: float  # s
+
+
 class Loop(NamedTuple):
-    """Constants of the three parts."""
+    """Constants of the three parts, and the orders of this step."""
 
     law: Any
     observer: Any
     plant: Any
+    orders: Orders = Orders(np.zeros(0), np.zeros((0, 3)), 0.0)
 
 
 class Air(NamedTuple):
@@ -106,6 +115,18 @@ def scratch(own: Floats, estimate: Floats, trains: int, corrections: int, messag
     )  # fmt: skip
 
 
+@bare(inline="always")
+def lead(i, loop, t, work):  # type: ignore[no-untyped-def]
+    """Let ``work.leader`` be that of train ``i``, if trains have their own."""
+    pace = loop.orders.pace
+    if pace.shape[0] > 0:
+        since = t - loop.orders.since
+        work.leader[0] = pace[i, 0] + since * (pace[i, 1] + 0.5 * since * pace[i, 2])
+        work.leader[1] = pace[i, 1] + since * pace[i, 2]
+        work.leader[2] = pace[i, 2]
+        work.leader[3] = 0.0
+
+
 @bare()
 def stage(parts, loop, first, links, reference, air, t, inside, own, estimate, work):  # type: ignore[no-untyped-def]
     """Evaluate the closed loop at one instant: fills ``work`` with forces and rates."""
@@ -113,11 +134,13 @@ def stage(parts, loop, first, links, reference, air, t, inside, own, estimate, w
     observed = estimate.shape[1] > 0
     leader_at(reference, t, inside, work.leader)
     age = 0.0 if air.live else t - air.sent_at
+    force = loop.orders.force
     for i in range(len(first) - 1):
         a, b = first[i], first[i + 1]
         if observed:
             correction(i, loop.observer, own[a:b], estimate[a:b], work.correction[a:b])
         if air.live and not air.chain:
+            lead(i, loop, t, work)
             message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
     for i in links.order:
         a, b = first[i], first[i + 1]
@@ -126,10 +149,14 @@ def stage(parts, loop, first, links, reference, air, t, inside, own, estimate, w
             for k in range(e, f):
                 for q in range(air.heard.shape[1]):
                     air.heard[k, q] = work.sent[links.sender[k], q]
+        lead(i, loop, t, work)
         demand(
             i, loop.law, work.leader, age, links.slot[i], own[a:b], estimate[a:b], work.correction[a:b],
             links.desired[e:f], air.heard[e:f], work.applied[a:b],
         )  # fmt: skip
+        if len(force) > 0 and force[a] == force[a]:  # not NaN
+            for u in range(a, b):
+                work.applied[u] = force[u]
         work.limited[i] = 1.0 if limit(i, loop.plant, own[a:b], work.applied[a:b]) else 0.0
         if observed:
             estimate_rate(
@@ -148,11 +175,12 @@ def exchange_kernel(functions, loop, first, links, reference, air, t, own, estim
     stage(parts, loop, first, links, reference, air, t, t, own, estimate, work)
     for i in range(len(first) - 1):
         a, b = first[i], first[i + 1]
+        lead(i, loop, t, work)
         message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
 
 
 @bare()
-def see(parts, loop, first, length, links, own, work, extremes):  # type: ignore[no-untyped-def]
+def see(parts, loop, first, length, links, t, own, work, extremes):  # type: ignore[no-untyped-def]
     """Widen ``extremes`` by the state and the forces of this instant; what is NaN widens nothing."""
     watch = parts[2]
     for i in range(len(first) - 1):
@@ -162,6 +190,7 @@ def see(parts, loop, first, length, links, own, work, extremes):  # type: ignore
             widen(extremes.force_min, extremes.force_max, u, force)
             if u + 1 < b:
                 widen(extremes.coupler_min, extremes.coupler_max, u, own[u, 0] - own[u + 1, 0] - length[u])
+        lead(i, loop, t, work)
         watch(i, loop.law, work.leader, first, own, links, extremes.watched[i])
         for q in range(extremes.watched.shape[1]):
             widen(extremes.watched_min[i], extremes.watched_max[i], q, extremes.watched[i, q])
@@ -214,7 +243,7 @@ def advance_kernel(functions, loop, first, length, links, reference, air, t, h, 
                     along(estimate, work.estimate, ahead, work.estimate_rate)
                 stage(parts, loop, first, links, reference, air, begin + ahead, begin + 0.5 * dt, own, estimate, work)
                 if s == 0:
-                    see(parts, loop, first, length, links, own, work, extremes)
+                    see(parts, loop, first, length, links, begin, own, work, extremes)
                     for i in range(len(work.limited)):
                         extremes.limited[i] += dt * work.limited[i]
                     if k == 0 and begin == t:
@@ -234,7 +263,7 @@ def advance_kernel(functions, loop, first, length, links, reference, air, t, h, 
 def signatures(loop: Any, first: Any, links: Any) -> tuple[Any, ...]:
     """Types of the seven functions for these types of ``Loop``, ``first`` and ``Links``, in the order of ``Parts.functions``."""
     whole, real, row, table = types.int64, types.float64, types.float64[::1], types.float64[:, ::1]
-    law, observer, plant = loop
+    law, observer, plant, _ = loop
     return (
         types.void(whole, law, row, real, real, table, table, table, row, table, row),
         types.void(whole, law, row, real, table, table, table, row),

@@ -111,6 +111,7 @@ def _start(scenario: Scenario, line: Line, edge: Ints, position: Floats, speed: 
     return Start(
         ids=scenario.ids, edge=edge[0], lane_position=position - line.start_m[edge[0]], speed=speed,
         length=consists.train_length(), unit_length=[consists.length[a:b] for a, b in pairwise(consists.first)], routes=routes,
+        present=np.ones(len(speed), bool), vclass=["rail"] * len(speed),
     )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -18,9 +19,10 @@ import numpy as np
 
 from sumo_net import Line
 from trainctl.errors import CouplingError, SimulatorError
-from trainctl.signals import Floats, Ints, Links
+from trainctl.signals import Bools, Floats, Ints, Links
 from trainctl.sumo.preflight import objections
-from trainctl.world import Seen, Start
+from trainctl.topology.ways import rerouted
+from trainctl.world import Seen, Start, lay_out
 
 #: Speed mode 32 switches off every speed correction of SUMO's; each inserted train starts with all of them on (31).
 SPEED_MODE_FREE = 32
@@ -38,7 +40,6 @@ OPTIONS = {
     "insertion-checks": "none",  # one train per block at insertion, even without signals: the second never appears
     "default.speeddev": "0",
     "no-step-log": "true",
-    "no-internal-links": "true",
     "fcd-output.distance": "true",
     "tripinfo-output.write-unfinished": "true",
     "vehroute-output.write-unfinished": "true",
@@ -58,36 +59,52 @@ LOGS = {
 }
 
 
-def write_routes(start: Start, path: Path) -> None:
-    """The trains as SUMO vehicles: true lengths and carriages, no randomness, no limits of SUMO's own."""
-    types: dict[tuple[float, ...], str] = {}
-    rows = []
+#: A train whose front is this close to the end of its way has left the net when SUMO's step ends (its POSITION_EPS).
+LEAVES_M = 0.1
+
+
+def write_routes(start: Start, path: Path) -> list[str]:
+    """The trains as SUMO vehicles: true lengths and carriages, no randomness, no limits of SUMO's own.
+
+    Those that come later have their types here and are added when they come. Returns the type of every train.
+    """
+    types: dict[tuple[str, tuple[float, ...]], str] = {}
+    rows, kinds = [], []
     for i, name in enumerate(start.ids):
         units = tuple(float(x) for x in start.unit_length[i])
-        kind = types.setdefault(units, f"train{len(types) + 1}")
-        route = " ".join(start.routes[i])
+        kinds.append(types.setdefault((start.vclass[i], units), f"train{len(types) + 1}"))
+        if not start.present[i]:
+            continue
+        route = " ".join(normal(start.routes[i]))
         rows.append(
-            f'    <vehicle id={quoteattr(name)} type="{kind}" depart="0" departLane="0" insertionChecks="none"'
+            f'    <vehicle id={quoteattr(name)} type="{kinds[-1]}" depart="0" departLane="0" insertionChecks="none"'
             f' departPos="{float(start.lane_position[i])!r}" departSpeed="{float(start.speed[i])!r}">\n'
             f'        <route edges="{route}"/>\n    </vehicle>\n'
         )
     with path.open("w", encoding="utf-8") as out:
         out.write("<routes>\n")
-        for units, kind in types.items():
+        for (vclass, units), kind in types.items():
             length = max(math.fsum(units), 1.0)  # SUMO has no points
             out.write(
-                f'    <vType id="{kind}" vClass="rail" guiShape="rail" length="{length!r}"'
+                f'    <vType id="{kind}" vClass="{vclass}" guiShape="rail" length="{length!r}"'
                 f' carriageLength="{max(max(units), 1.0)!r}" carriageGap="0" minGap="0" sigma="0"'
                 ' speedFactor="1" speedDev="0" maxSpeed="500" accel="100" decel="100"'
                 ' emergencyDecel="1000"/>\n'
             )
         out.writelines(rows)
         out.write("</routes>\n")
+    return kinds
 
 
-def write_configuration(folder: Path, net: str, routes: str, step: float, end: float) -> Path:
-    """``run.sumocfg``: SUMO's own sumo and sumo-gui open it."""
+def normal(route: Iterable[str]) -> list[str]:
+    """A route as SUMO takes it: without internal edges."""
+    return [edge for edge in route if not edge.startswith(":")]
+
+
+def write_configuration(folder: Path, net: str, routes: str, step: float, end: float, internal: bool = False) -> Path:
+    """``run.sumocfg``: SUMO's own sumo and sumo-gui open it. ``internal`` says whether the net has edges inside junctions."""
     options = {"net-file": net, "route-files": routes, "begin": "0", "end": f"{end:.3f}", "step-length": f"{step:g}", **OPTIONS}
+    options |= {"collision.check-junctions": "true"} if internal else {"no-internal-links": "true"}
     path = folder / "run.sumocfg"
     body = "".join(f"    <{key} value={quoteattr(value)}/>\n" for key, value in options.items())
     path.write_text(f"<configuration>\n{body}</configuration>\n", encoding="utf-8")
@@ -104,7 +121,7 @@ class Sumo:
 
     def __init__(self, line: Line, net: Path, folder: Path, step: float, steps: int) -> None:
         self.line, self.net, self.folder, self.time_step, self.steps = line, net, folder, step, steps
-        self.index = {e: k for k, e in enumerate(line.edges)}
+        self.internal = any(edge.startswith(":") for edge in line.edges)
         self.began = False
 
     def start(self, start: Start) -> None:
@@ -113,22 +130,23 @@ class Sumo:
         wrong = objections(self.line, self.time_step)
         if wrong:
             raise SimulatorError("; ".join(wrong))
-        write_routes(start, self.folder / "trains.rou.xml")
+        self.kinds = write_routes(start, self.folder / "trains.rou.xml")
         end = (self.steps + 1) * self.time_step
-        configuration = write_configuration(self.folder, self.net.name, "trains.rou.xml", self.time_step, end)
-        self.ids = list(start.ids)
+        configuration = write_configuration(
+            self.folder, self.net.name, "trains.rou.xml", self.time_step, end, self.internal
+        )
+        self.ids, self.routes, self.departs_m = list(start.ids), list(start.routes), start.lane_position
+        self.ways = lay_out(self.line, start)
+        self.coming: list[tuple[int, float]] = []
         logs = [part for key, name in LOGS.items() for part in (f"--{key}", str(self.folder / name))]
         self._call(self._launch, ["-c", str(configuration), *logs])
         self.began = True
         self._call(self.api.simulationStep)
-        self._verify_insertion(start)
-        vehicle = self.api.vehicle
-        for name in self.ids:
-            vehicle.setSpeedMode(name, SPEED_MODE_FREE)
-            vehicle.setLaneChangeMode(name, 0)
-        everyone = np.arange(len(self.ids))
-        edge = self._edges(everyone)
-        self.seen = Seen(self.line.start_m[edge] + self._lane_positions(), edge)
+        everyone = np.flatnonzero(start.present)
+        self._verify_insertion(everyone, start.speed[everyone])
+        row = self.ways.first[:-1].copy()
+        self.seen = Seen(self.ways.begin[row] + start.lane_position, self.ways.edge[row], row, start.present.copy())
+        self.seen.position[everyone] = self.ways.begin[row[everyone]] + self._lane_positions(everyone)
 
     def _ready(self) -> None:
         """Whether SUMO can be started at all."""
@@ -138,20 +156,24 @@ class Sumo:
     def _launch(self, options: list[str]) -> None:
         libsumo.start(["sumo", *options])
 
-    def _verify_insertion(self, start: Start) -> None:
-        present = set(self.api.vehicle.getIDList())
+    def _verify_insertion(self, trains: Ints, speeds: Floats) -> None:
+        """Whether these trains are where they were put; takes every speed correction off them."""
+        vehicle = self.api.vehicle
+        present = set(vehicle.getIDList())
         wrong = []
-        for i, name in enumerate(self.ids):
+        for i, wanted_speed in zip(trains.tolist(), speeds.tolist(), strict=True):
+            name, edge = self.ids[i], self.line.edges[self.ways.edge[self.ways.first[i]]]
             if name not in present:
-                wrong.append(f"train {name} was not inserted on edge {self.line.edges[start.edge[i]]}")
+                wrong.append(f"train {name} was not inserted on edge {edge}")
                 continue
-            edge, where = self.api.vehicle.getRoadID(name), self.api.vehicle.getLanePosition(name)
-            speed = self.api.vehicle.getSpeed(name)
-            if edge != self.line.edges[start.edge[i]] or abs(where - start.lane_position[i]) > TOLERANCE_M:
-                wanted = f"{self.line.edges[start.edge[i]]} at {start.lane_position[i]:.6f} m"
-                wrong.append(f"train {name} was inserted on {edge} at {where:.6f} m instead of {wanted}")
-            elif abs(speed - start.speed[i]) > TOLERANCE_M:
-                wrong.append(f"train {name} was inserted at {speed:.6f} m/s instead of {start.speed[i]:.6f} m/s")
+            on, where, speed = vehicle.getRoadID(name), vehicle.getLanePosition(name), vehicle.getSpeed(name)
+            if on != edge or abs(where - self.departs_m[i]) > TOLERANCE_M:
+                wanted = f"{edge} at {self.departs_m[i]:.6f} m"
+                wrong.append(f"train {name} was inserted on {on} at {where:.6f} m instead of {wanted}")
+            elif abs(speed - wanted_speed) > TOLERANCE_M:
+                wrong.append(f"train {name} was inserted at {speed:.6f} m/s instead of {wanted_speed:.6f} m/s")
+            vehicle.setSpeedMode(name, SPEED_MODE_FREE)
+            vehicle.setLaneChangeMode(name, 0)
         if wrong:
             raise CouplingError("; ".join(wrong))
 
@@ -159,62 +181,100 @@ class Sumo:
         """Front positions on the line and edges."""
         return self.seen
 
-    def _lane_positions(self) -> Floats:
-        return np.fromiter(map(self.api.vehicle.getLanePosition, self.ids), np.float64, len(self.ids))
+    def _lane_positions(self, trains: Ints) -> Floats:
+        names = self.ids if len(trains) == len(self.ids) else [self.ids[i] for i in trains.tolist()]
+        return np.fromiter(map(self.api.vehicle.getLanePosition, names), np.float64, len(trains))
 
-    def _edges(self, trains: Ints) -> Ints:
-        """The edges these trains are on, asked one by one."""
+    def _rows(self, trains: Ints) -> Ints:
+        """The rows of the edges these trains are on, asked one by one."""
         road = self.api.vehicle.getRoadID
         found = np.empty(len(trains), np.int64)
         for k, i in enumerate(trains.tolist()):
+            row, end = int(self.seen.row[i]), int(self.ways.first[i + 1])
             try:
-                found[k] = self.index[road(self.ids[i])]
-            except (self.api.TraCIException, KeyError) as error:
-                raise CouplingError(
-                    f"train {self.ids[i]} is not on the line at {self._time():.3f} s: {error}; did it reach the line's end?"
-                ) from None
+                edge = self.line.index[road(self.ids[i])]
+                ahead = np.flatnonzero(self.ways.edge[row:end] == edge)
+                found[k] = row + ahead[0]
+            except (self.api.TraCIException, KeyError, IndexError) as error:
+                why = f"{error}; did it reach the line's end?" if not isinstance(error, IndexError) else "it left its way"
+                raise CouplingError(f"train {self.ids[i]} is not on the line at {self._time():.3f} s: {why}") from None
         return found
 
-    def _read(self, wanted: Floats) -> Seen:
+    def _read(self, wanted: Floats, present: Bools) -> Seen:
         """Where the trains are that should be at ``wanted`` (n,), with one call per train.
 
         A train that is where it should be, and not near the end of its edge, is on the edge it was on.
         """
-        line, edge = self.line, self.seen.edge
+        ways, row = self.ways, self.seen.row
+        there = np.flatnonzero(present)
+        begin = ways.begin[row]
         try:
-            lane_position = self._lane_positions()
+            lane_position = self._lane_positions(there)
         except self.api.TraCIException:
-            self._edges(np.arange(len(self.ids)))  # tells which train
+            self._rows(there)  # tells which train
             raise
-        position = line.start_m[edge] + lane_position
-        at_the_end = wanted > line.start_m[edge] + line.length_m[edge] - NEAR_M
-        ask = np.flatnonzero(at_the_end | ~(np.abs(position - wanted) <= TOLERANCE_M))
+        position = wanted.copy()
+        position[there] = begin[there] + lane_position
+        at_the_end = wanted > begin + self.line.length_m[ways.edge[row]] - NEAR_M
+        ask = np.flatnonzero((at_the_end | ~(np.abs(position - wanted) <= TOLERANCE_M)) & present)
         if len(ask):
-            edge = edge.copy()
-            edge[ask] = self._edges(ask)
-            position[ask] = line.start_m[edge[ask]] + lane_position[ask]
-        return Seen(position, edge)
+            row = row.copy()
+            row[ask] = self._rows(ask)
+            position[ask] = ways.begin[row[ask]] + lane_position[np.searchsorted(there, ask)]
+        return Seen(position, ways.edge[row], row, present)
 
     def route(self, train: int, edges: tuple[str, ...]) -> None:
         """Give a train another route."""
-        self._call(self.api.vehicle.setRoute, self.ids[train], list(edges))
+        self._call(self.api.vehicle.setRoute, self.ids[train], normal(edges))
+        line, row, before = self.line, int(self.seen.row[train]), self.ways.first
+        self.ways = rerouted(self.ways, train, row, [line.index[e] for e in edges], line.start_m, line.length_m)
+        self.seen = self.seen._replace(row=self.seen.row + self.ways.first[:-1] - before[:-1])
+
+    def insert(self, train: int, speed: float) -> None:
+        """Put a train on the net where it was to start; it is there after the next ``move``."""
+        name = self.ids[train]
+        self._call(self.api.route.add, f"way_{name}", normal(self.routes[train]))
+        self._call(
+            self.api.vehicle.add, name, f"way_{name}", typeID=self.kinds[train], depart="now", departLane="first",
+            departPos=repr(float(self.departs_m[train])), departSpeed=repr(speed),
+        )  # fmt: skip
+        self.coming.append((train, speed))
 
     def linked(self, links: Links, formation: Ints) -> None:
         """Nobody looks."""
 
     def move(self, displacement: Floats, step: float) -> None:
         """Command the mean speed of the step, displacement / T: SUMO's Euler update then moves the train by just that."""
-        before = self.seen.position
-        self._call(self._command, (displacement / step).tolist())
+        before, present = self.seen.position, self.seen.present
+        self._call(self._command, np.flatnonzero(present), displacement / step)
         self._call(self.api.simulationStep)
-        now = self.seen = self._read(before + displacement)
-        wrong = np.flatnonzero(np.abs(now.position - before - displacement) > TOLERANCE_M)
+        wanted = np.where(present, before + displacement, before)
+        present = present & ~self._left(wanted, present)
+        now = self._read(wanted, present)
+        wrong = np.flatnonzero(np.abs(now.position - wanted) > TOLERANCE_M)
         if len(wrong):
             raise CouplingError("; ".join(self._explain(int(i), now, before, displacement) for i in wrong[:5]))
+        if self.coming:
+            trains = np.array([i for i, _ in self.coming])
+            self._verify_insertion(trains, np.array([speed for _, speed in self.coming]))
+            now.present[trains] = True
+            self.coming.clear()
+        self.seen = now
 
-    def _command(self, speeds: list[float]) -> None:
+    def _left(self, wanted: Floats, present: Bools) -> Bools:
+        """Which trains have left the net at the end of their way."""
+        last = self.ways.first[1:] - 1
+        end = self.ways.begin[last] + self.line.length_m[self.ways.edge[last]]
+        near = present & (wanted > end - LEAVES_M - TOLERANCE_M)
+        if near.any():
+            gone = set(self.api.simulation.getArrivedIDList())
+            near &= np.array([name in gone for name in self.ids])
+        return near
+
+    def _command(self, trains: Ints, speeds: Floats) -> None:
         set_speed = self.api.vehicle.setSpeed
-        for name, speed in zip(self.ids, speeds, strict=True):
+        names = self.ids if len(trains) == len(self.ids) else [self.ids[i] for i in trains.tolist()]
+        for name, speed in zip(names, speeds[trains].tolist(), strict=True):
             set_speed(name, speed)
 
     def _explain(self, i: int, now: Seen, before: Floats, displacement: Floats) -> str:

@@ -1,0 +1,70 @@
+"""The way of every train: the edges it has run over since its departure and will run over, as one table of rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from trainctl.signals import Floats, Ints
+
+#: Two kilometrages of one place agree to rounding.
+SAME_M = 1e-6
+
+
+class Ways(NamedTuple):
+    """Ways of n trains, one after the other: rows ``first[i]:first[i + 1]`` are those of train ``i``."""
+
+    first: Ints  # (n + 1,)
+    edge: Ints  # (W,) edge numbers in running order, internal edges included
+    begin: Floats  # (W,) m, position at which the edge begins; grows along a way by the lengths of its edges
+
+    @property
+    def start(self) -> Floats:
+        """Where every way begins [m], shape (n,)."""
+        return self.begin[self.first[:-1]]
+
+
+def ways(routes: Sequence[Sequence[int] | Ints], start_m: Floats, length_m: Floats) -> Ways:
+    """Lay out ways along edges.
+
+    Parameters
+    ----------
+    routes : sequence of sequence of int
+        Edge numbers of each train's way, in running order.
+    start_m, length_m : ndarray, shape (E,)
+        Kilometrage at the beginning of every edge, and its length [m].
+
+    Returns
+    -------
+    Ways
+        Positions are the kilometrage of the first edge carried on along the way; where the kilometrage of a later edge agrees to
+        rounding it is taken as it is, so that trains on one line have the very same positions.
+    """
+    parts = [np.asarray(route, np.int64) for route in routes]
+    return Ways(
+        first=np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64),
+        edge=np.concatenate([*parts, np.zeros(0, np.int64)]),
+        begin=np.concatenate([*(_begins(part, float(start_m[part[0]]), start_m, length_m) for part in parts), np.zeros(0)]),
+    )
+
+
+def _begins(edges: Ints, begin: float, start_m: Floats, length_m: Floats) -> Floats:
+    carried = begin + np.concatenate([[0.0], np.cumsum(length_m[edges[:-1]])])
+    given = start_m[edges] + (begin - start_m[edges[0]])
+    found: Floats = np.where(np.abs(given - carried) < SAME_M, given, carried)
+    return found
+
+
+def rerouted(old: Ways, train: int, row: int, edges: Sequence[int] | Ints, start_m: Floats, length_m: Floats) -> Ways:
+    """Ways with another one for ``train`` from ``row`` on: ``edges`` begins with the edge of that row."""
+    a, b = int(old.first[train]), int(old.first[train + 1])
+    new = np.asarray(edges, np.int64)
+    begins = _begins(new, float(old.begin[row]), start_m, length_m)
+    longer = row - a + len(new) - (b - a)
+    return Ways(
+        first=old.first + np.where(np.arange(len(old.first)) > train, longer, 0),
+        edge=np.concatenate([old.edge[:row], new, old.edge[b:]]),
+        begin=np.concatenate([old.begin[:row], begins, old.begin[b:]]),
+    )
