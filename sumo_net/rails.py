@@ -20,13 +20,14 @@ from numpy.typing import NDArray
 
 from sumo_net.layout import Floats
 from sumo_net.line import Ints, Line, line_of
-from sumo_net.netfile import RAIL, NetEdge, NetFile, NetJunction, read_net
+from sumo_net.netfile import RAIL, NetFile, NetJunction, read_net
 from sumo_net.spec import TRACK_SPACING_M, LineError
 
 Bools = NDArray[np.bool_]
 Pairs = set[tuple[int, int]]
 
 _SHORTEST_LANE_M = 0.1  # SUMO makes every lane at least this long
+_TOUCH_M = 1.0  # below it tracks meet; two tracks side by side are more than 2.5 m apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +43,8 @@ class Rails:
     after: tuple[tuple[int, ...], ...]  # where each edge leads, in ascending order
     before: tuple[tuple[int, ...], ...]  # where each edge is entered from
     twin: Ints  # (E,) the same track in the other direction, -1 if there is none
-    crossing: tuple[tuple[int, ...], ...]  # internal edges whose tracks cross or touch this one on its junction
-    reversal: frozenset[tuple[int, int]]  # normal edges (from, to) between which a train changes its direction
+    crossing: tuple[tuple[int, ...], ...]  # internal edges whose tracks cross or touch this one on its junction, see _crossing()
+    reversal: frozenset[tuple[int, int]]  # pairs of after from an edge to its twin: there a train changes its direction
 
     @classmethod
     def read(cls, path: str | Path) -> Rails:
@@ -105,13 +106,13 @@ class Rails:
 
     @cached_property
     def chains(self) -> dict[tuple[int, int], tuple[int, ...]]:
-        """For every connection (from, to) of normal edges the internal edges between them; none where the net has none."""
+        """For every connection (from, to) of normal edges the internal edges between: none on a net without, or on a reversal."""
         return dict(_chains(self.after, self.internal))
 
     @cached_property
     def onward(self) -> tuple[tuple[int, ...], ...]:
         """``after`` without the reversals: where each edge leads a train that keeps its direction."""
-        return _onward(self.after, self.chains, self.reversal)
+        return _onward(self.after, self.reversal)
 
     def way(self, edges: Sequence[str]) -> Ints:
         """The edges a train runs over on a route, shape (W,).
@@ -211,11 +212,8 @@ def _chains(after: Sequence[tuple[int, ...]], internal: Bools) -> Iterator[tuple
             yield (a, here), tuple(chain)
 
 
-def _onward(
-    after: tuple[tuple[int, ...], ...], chains: dict[tuple[int, int], tuple[int, ...]], reversal: frozenset[tuple[int, int]]
-) -> tuple[tuple[int, ...], ...]:
-    back = {link for a, b in reversal for link in pairwise((a, *chains[a, b], b))}
-    return tuple(tuple(b for b in row if (a, b) not in back) for a, row in enumerate(after)) if back else after
+def _onward(after: tuple[tuple[int, ...], ...], reversal: frozenset[tuple[int, int]]) -> tuple[tuple[int, ...], ...]:
+    return tuple(tuple(b for b in row if (a, b) not in reversal) for a, row in enumerate(after)) if reversal else after
 
 
 class _Link(NamedTuple):
@@ -224,112 +222,162 @@ class _Link(NamedTuple):
     begin: str
     end: str
     lanes: tuple[str, ...]
-    reverses: bool
 
 
-def _rail_lane(edge: NetEdge) -> dict[str, str] | None:
-    """The first lane made for trains."""
-    return next((lane for lane in edge.lanes if RAIL & set(lane.get("allow", "").split())), None)
+def _for_trains(lane: dict[str, str]) -> bool:
+    return not RAIL.isdisjoint(lane.get("allow", "").split())
 
 
 def _edge_of(lane: str) -> str:
     return lane.rpartition("_")[0]
 
 
-def _links(net: NetFile, lanes: set[str], file: str) -> list[_Link]:
-    """The connections trains can take, once for each pair of edges."""
-    onward = {
-        f"{c['from']}_{c['fromLane']}": c["via"] for c in net.connections if c["from"].startswith(":") and c.get("via") in lanes
-    }
+def _links(connections: list[dict[str, str]], lanes: set[str], bidi: dict[str, str]) -> list[_Link]:
+    """The connections trains can take over the given lanes, one for each pair of edges.
+
+    Where a connection has a place to wait on its junction, its internal lanes are a chain. A train that reverses jumps from an
+    edge to its twin (measured: SUMO 1.28 moves it over no internal edge, though the net has one).
+    """
+    rows = [
+        (c["from"], c["to"], f"{c['from']}_{c.get('fromLane')}", f"{c['to']}_{c.get('toLane')}", c.get("via"))
+        for c in connections
+        if "from" in c and "to" in c
+    ]
+    further = {leaves: via for begin, _, leaves, _, via in rows if begin.startswith(":") and via is not None}
     found: dict[tuple[str, str], _Link] = {}
-    for c in net.connections:
-        begin, end = c["from"], c["to"]
-        if begin.startswith(":") or f"{begin}_{c['fromLane']}" not in lanes or f"{end}_{c['toLane']}" not in lanes:
+    for begin, end, leaves, enters, via in rows:
+        if begin.startswith(":") or (begin, end) in found or leaves not in lanes or enters not in lanes:
             continue
-        chain, via = [], c.get("via")
-        while via is not None:
-            if via not in lanes or via in chain:
-                break
+        chain: list[str] = []
+        while via is not None and via not in chain and bidi.get(begin) != end:
             chain.append(via)
-            via = onward.get(via)
-        if via is None:
-            found.setdefault((begin, end), _Link(begin, end, tuple(chain), c.get("dir") == "t"))
+            via = further.get(via)
+        if lanes.issuperset(chain):
+            found[begin, end] = _Link(begin, end, tuple(chain))
     return list(found.values())
 
 
 def _shape(lane: dict[str, str]) -> Floats:
-    """Points of a lane [m], shape (P, 3), heights 0 if the net is flat."""
-    points = [[float(v) for v in point.split(",")] for point in lane.get("shape", "").split()]
-    return np.array([(p + [0.0])[:3] for p in points]).reshape(-1, 3)
+    """Points of a lane [m], shape (P, 3) with P >= 2; heights are 0 where the net has none."""
+    points = [[float(v) for v in point.split(",")] for point in lane["shape"].split()]
+    if len(points) < 2 or not all(len(p) in (2, 3) for p in points):
+        raise ValueError(f"shape = {lane['shape']!r}: two points at least, x,y or x,y,z each")
+    return np.array([(*p, 0.0)[:3] for p in points])
 
 
-def _slope(lane: dict[str, str]) -> float:
-    shape = _shape(lane) if lane.get("shape", "").partition(" ")[0].count(",") == 2 else np.zeros((0, 3))
+def _slope(shape: Floats) -> float:
     run = float(np.hypot(*np.diff(shape[:, :2], axis=0).T).sum())
     return float(shape[-1, 2] - shape[0, 2]) / run if run > 0 else 0.0
 
 
+def _measure(lane: dict[str, str]) -> tuple[float, float, Floats]:
+    """Length [m], limit [m/s] and shape of a lane."""
+    length, speed = float(lane["length"]), float(lane["speed"])
+    if not (0 < length < np.inf and 0 < speed < np.inf):
+        raise ValueError(f"length = {length:g}, speed = {speed:g}: must be positive")
+    return max(length, _SHORTEST_LANE_M), speed, _shape(lane)
+
+
 def _rails(net: NetFile, file: str) -> Rails:
-    lane_of = {e.attributes.get("id", ""): lane for e in net.edges if (lane := _rail_lane(e)) is not None}
-    normal = [e for e in net.edges if e.attributes.get("function", "normal") == "normal" and e.attributes.get("id") in lane_of]
+    by_id = {e.attributes.get("id", ""): e for e in net.edges}
+    lane_of = {name: lane for name, e in by_id.items() if (lane := next(filter(_for_trains, e.lanes), None)) is not None}
+    normal = [by_id[name] for name in lane_of if by_id[name].attributes.get("function", "normal") == "normal"]
     if not normal:
-        raise LineError([f"{file}: has no rail edges"])
-    lanes = {lane["id"] for e in net.edges for lane in e.lanes if RAIL & set(lane.get("allow", "").split())}
-    links = _links(net, lanes, file)
+        raise LineError([f"{file}: has no rail edges: none of its lanes allows a rail class by name"])
+    bidi = {name: e.attributes.get("bidi", "") for name, e in by_id.items()}
+    lanes = {lane.get("id", "") for e in net.edges for lane in e.lanes if _for_trains(lane)}
+    links = _links(net.connections, lanes, bidi)
     used = {_edge_of(lane) for link in links for lane in link.lanes}
-    line = line_of(normal, file) if all("track" in e.params for e in normal) and not used else None
-    names = list(line.edges) if line else [e.attributes["id"] for e in normal]
-    names += [name for e in net.edges if (name := e.attributes.get("id", "")) in used]
-    values, mistakes = [], []
+    ours = not used and all("track" in e.params for e in normal)
+    line = line_of(normal, file) if ours else None
+    names = [*(line.edges if line else (e.attributes.get("id", "") for e in normal)), *(name for name in lane_of if name in used)]
+    rows, mistakes = [], []
     for name in names:
-        lane = lane_of[name]
         try:
-            values.append((max(float(lane["length"]), _SHORTEST_LANE_M), float(lane["speed"]), _slope(lane)))
+            rows.append(_measure(lane_of[name]))
         except KeyError as missing:
             mistakes.append(f"{file}: edge {name}: has no {missing.args[0]}")
         except ValueError as error:
             mistakes.append(f"{file}: edge {name}: {error}")
     if mistakes:
         raise LineError(mistakes)
-    length, speed, slope = np.array(values).T.copy()
     index = {name: k for k, name in enumerate(names)}
-    internal = np.array([name.startswith(":") for name in names])
-    ways = {link: tuple(index[e] for e in (link.begin, *map(_edge_of, link.lanes), link.end)) for link in links}
-    pairs = {pair for way in ways.values() for pair in pairwise(way)}
+    length = np.array([row[0] for row in rows])
+    ways = [tuple(index[edge] for edge in (link.begin, *map(_edge_of, link.lanes), link.end)) for link in links]
+    pairs = {pair for way in ways for pair in pairwise(way)}
     after = _neighbours(len(names), pairs)
-    reversal = frozenset((way[0], way[-1]) for link, way in ways.items() if link.reverses)
-    bidi = {e.attributes.get("id", ""): e.attributes.get("bidi", "") for e in net.edges}
-    twin = np.array([index.get(bidi[name], -1) for name in names], np.int64)
-    chains = dict(_chains(after, internal))
+    reversal = frozenset((index[link.begin], index[link.end]) for link in links if bidi[link.begin] == link.end)
+    twin = _twins(np.array([index.get(bidi[name], -1) for name in names], np.int64), ways)
+    on = {lane: way for link, way in zip(links, ways, strict=True) for lane in link.lanes}
     return Rails(
         edges=tuple(names),
-        internal=internal,
+        internal=np.array([name in used for name in names]),
         length_m=length,
-        speed_mps=speed,
-        start_m=line.start_m.copy() if line else potential(length, _onward(after, chains, reversal)),
-        slope=slope,
+        speed_mps=np.array([row[1] for row in rows]),
+        start_m=line.start_m.copy() if line else potential(length, _onward(after, reversal)),
+        slope=np.array([_slope(row[2]) for row in rows]),
         after=after,
         before=_neighbours(len(names), {(b, a) for a, b in pairs}),
         twin=twin,
-        crossing=_crossing(net.junctions, ways, lane_of, twin),
+        crossing=_crossing(net.junctions, on, [row[2] for row in rows], twin, file),
         reversal=reversal,
     )
 
 
+def _twins(twin: Ints, ways: list[tuple[int, ...]]) -> Ints:
+    """``twin`` with the internal edges that old nets do not pair: the way back over the twins of both ends is the same track."""
+    back = {(way[0], way[-1]): way for way in ways}
+    for way in ways:
+        other = back.get((int(twin[way[-1]]), int(twin[way[0]])), ())
+        if len(other) == len(way):
+            for here, there in zip(way[1:-1], other[-2:0:-1], strict=True):
+                if twin[here] < 0:
+                    twin[here] = there
+    return twin
+
+
 def _crossing(
-    junctions: list[NetJunction], ways: dict[_Link, tuple[int, ...]], lane_of: dict[str, dict[str, str]], twin: Ints
+    junctions: list[NetJunction], on: dict[str, tuple[int, ...]], shapes: list[Floats], twin: Ints, file: str
 ) -> tuple[tuple[int, ...], ...]:
-    on = {lane: way for link, way in ways.items() for lane in link.lanes if not link.reverses}
+    """Which internal edges exclude each other without a common beginning or end.
+
+    Two ways over a junction do if the net calls them foes, if they end on the same track from its two directions, or if their
+    centre lines come within ``_TOUCH_M``. Foes alone do not do: netconvert gives them for tracks that cross, but only for half
+    of those that meet head on at a switch, for none that only touch, and for none at all on an unregulated junction.
+
+    A track and its twin do not cross each other, nor do ways that branch or merge.
+    """
     pairs: Pairs = set()
-    for junction in junctions:
-        rows = [on.get(lane) for lane in junction.attributes.get("intLanes", "").split()]
-        foes = {int(r["index"]): r["foes"][::-1] for r in junction.requests}
-        for (i, one), (j, other) in combinations([(i, way) for i, way in enumerate(rows) if way is not None], 2):
-            if one[0] == other[0] or one[-1] == other[-1]:
-                continue
-            if twin[one[0]] == other[-1] and twin[one[-1]] == other[0]:
+    for junction in junctions if on else ():
+        lanes = [(k, on[lane]) for k, lane in enumerate(junction.attributes.get("intLanes", "").split()) if lane in on]
+        try:
+            foes = {int(row["index"]): row["foes"][::-1] for row in junction.requests}
+        except (KeyError, ValueError):
+            raise LineError([f"{file}: junction {junction.attributes.get('id', '')}: its requests are broken"]) from None
+        for (i, one), (j, other) in combinations(lanes, 2):
+            head, tail = twin[one[0]] == other[-1], twin[one[-1]] == other[0]
+            if one[0] == other[0] or one[-1] == other[-1] or (head and tail):
                 continue
             foe = foes.get(i, "")[j : j + 1] == "1" or foes.get(j, "")[i : i + 1] == "1"
-            if foe or twin[one[0]] == other[-1] or twin[one[-1]] == other[0]:
-                pairs |= {(a, b) for a in one[1:-1] for b in other[1:-1]}
+            if head or tail or foe or _apart(*(np.vstack([shapes[k] for k in way[1:-1]]) for way in (one, other))) < _TOUCH_M:
+                pairs.update((a, b) for a in one[1:-1] for b in other[1:-1])
     return _neighbours(len(twin), pairs | {(b, a) for a, b in pairs})
+
+
+def _apart(one: Floats, other: Floats) -> float:
+    """The least distance of two polylines (P, 3) and (Q, 3) seen from above [m]; 0 where they cross."""
+    a, b, c, d = one[:-1, None, :2], one[1:, None, :2], other[None, :-1, :2], other[None, 1:, :2]
+
+    def side(begin: Floats, end: Floats, point: Floats) -> Floats:
+        along, to = end - begin, point - begin
+        return np.asarray(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
+
+    if ((side(a, b, c) * side(a, b, d) < 0) & (side(c, d, a) * side(c, d, b) < 0)).any():
+        return 0.0
+
+    def distance(point: Floats, begin: Floats, end: Floats) -> float:
+        along, to = end - begin, point - begin
+        part = np.clip((to * along).sum(-1) / np.maximum((along * along).sum(-1), 1e-12), 0.0, 1.0)
+        return float(np.hypot(*np.moveaxis(to - part[..., None] * along, -1, 0)).min())
+
+    return min(distance(a, c, d), distance(b, c, d), distance(c, a, b), distance(d, a, b))
