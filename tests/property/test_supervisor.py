@@ -1,0 +1,240 @@
+"""Whatever is demanded, supervised trains do not reach what they must not reach; unsupervised ones do."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from trainctl import supervisor
+from trainctl.supervisor import END, KINDS, OPPOSING, STOP, SWITCH, TRAIN, Limits, Params, Targets
+
+PER_COLUMN = 6
+DRIVERS = ("random", "bang-bang", "full traction", "against the follower", "no numbers")
+ROUNDING = 1e-6
+
+
+class World(NamedTuple):
+    """Columns one beside the other, each PER_COLUMN trains front to rear; fronts and rears along the column's own way."""
+
+    columns: int
+    length: np.ndarray
+    limit_from: np.ndarray  # (columns, 8) m
+    limit: np.ndarray  # (columns, 8) m/s
+    end: np.ndarray  # (columns,) m, where the way ends
+
+    @property
+    def first(self) -> np.ndarray:
+        return np.arange(self.columns * PER_COLUMN) % PER_COLUMN == 0
+
+
+def behind(world: World, x: np.ndarray, v: np.ndarray) -> Targets:
+    """Each train's target: the rear of the train ahead of it."""
+    rows = np.flatnonzero(~world.first)
+    ahead = rows - 1
+    room = x[ahead] - world.length[ahead] - x[rows]
+    return Targets(rows, room, v[ahead], np.ones(len(rows), bool), np.full(len(rows), TRAIN), ahead)
+
+
+def fixed(rows: np.ndarray, room: np.ndarray, kind: int) -> Targets:
+    return Targets(rows, room, np.zeros(len(rows)), np.zeros(len(rows), bool), np.full(len(rows), kind), np.full(len(rows), -1))
+
+
+def facing(rows: np.ndarray, others: np.ndarray, room: np.ndarray, v: np.ndarray) -> Targets:
+    return Targets(
+        np.concatenate([rows, others]), np.concatenate([room, room]), np.concatenate([v[others], v[rows]]),
+        np.ones(2 * len(rows), bool), np.full(2 * len(rows), OPPOSING), np.concatenate([others, rows]),
+    )  # fmt: skip
+
+
+def joined(*parts: Targets) -> Targets:
+    return Targets(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def demanded(driver: str, rng: np.random.Generator, k: int, world: World, v: np.ndarray) -> np.ndarray:
+    n = len(v)
+    if driver == "random":
+        return rng.uniform(-3.0, 3.0, n)
+    if driver == "bang-bang":  # each train holds full traction or full braking for some steps
+        return np.where(np.sin(0.01 * (1 + np.arange(n) % 17) * k + np.arange(n)) > -0.3, 9.0, -9.0)
+    if driver == "against the follower":  # every other train goes and stops dead, the rest press on
+        return np.where(np.arange(n) % 2 == 0, np.where(k // 150 % 2 == 0, 9.0, -9.0), 9.0)
+    if driver == "no numbers":
+        return rng.choice([np.nan, np.inf, np.inf, np.inf, -np.inf], n)
+    return np.full(n, 9.0)
+
+
+def moved(x: np.ndarray, v: np.ndarray, a: np.ndarray, step: float, theta: float) -> tuple[np.ndarray, np.ndarray]:
+    after = np.maximum(0.0, v + a * step)
+    return x + ((1.0 - theta) * v + theta * after) * step, after
+
+
+def limits_of(world: World, x: np.ndarray) -> Limits:
+    rows = np.repeat(np.arange(len(x)), world.limit.shape[1])
+    begin = world.limit_from[np.arange(len(x)) // PER_COLUMN].ravel()
+    until = np.column_stack([world.limit_from[:, 1:], np.full(world.columns, np.inf)])[np.arange(len(x)) // PER_COLUMN].ravel()
+    told = x[rows] < until
+    return Limits(rows[told], (begin - x[rows])[told], world.limit[np.arange(len(x)) // PER_COLUMN].ravel()[told])
+
+
+def start(
+    rng: np.random.Generator, columns: int, params: Params, step: float, theta: float
+) -> tuple[World, np.ndarray, np.ndarray]:
+    """Columns packed as tightly as the speeds allow, or looser, on ways with limits that no train yet breaks."""
+    n = columns * PER_COLUMN
+    v = rng.uniform(0.0, 80.0, n) * (rng.random(n) < 0.85)
+    length = rng.uniform(20.0, 400.0, n)
+    way = supervisor.stopping_distance(v, params.emergency_mps2, step, theta)
+    x = np.zeros(n)
+    for i in range(n):
+        if i % PER_COLUMN:
+            ahead = way[i - 1] if params.curve == "relative" else 0.0
+            slack = rng.choice([0.0, 0.0, rng.exponential(300.0)])
+            x[i] = x[i - 1] - length[i - 1] - params.margin_m - max(0.0, way[i] - ahead) - slack
+    top = np.maximum.reduceat(x + 1.6 * way, np.arange(0, n, PER_COLUMN))
+    begin = np.column_stack([np.full(columns, -np.inf), top[:, None] + np.cumsum(rng.exponential(900.0, (columns, 7)), 1) + 700.0])
+    limit = np.column_stack([np.full(columns, 85.0), rng.uniform(3.0, 85.0, (columns, 7))])
+    # Far enough to brake for the first limit with 0.7 m/s2 from the fastest start in whole steps.
+    begin[:, 1:] += 80.0**2 / (2 * params.service_mps2) + 85.0 * step * 2
+    return World(columns, length, begin, limit, begin[:, -1] + rng.uniform(300.0, 3000.0, columns)), x, v
+
+
+def ended(world: World, x: np.ndarray) -> Targets:
+    heads = np.flatnonzero(world.first)
+    return fixed(heads, world.end - x[heads], END)
+
+
+CASES = [(0.0, 0.2), (0.5, 0.2), (0.0, 1.0), (0.5, 1.0), (0.0, 2.0), (0.5, 0.7), (0.25, 0.5)]
+
+
+@pytest.mark.parametrize("curve", ["relative", "absolute"])
+@pytest.mark.parametrize(("theta", "step"), CASES)
+def test_columns_under_any_driver_keep_the_margin_and_the_limits(theta, step, curve):
+    params = Params(mode="on", curve=curve, emergency_mps2=1.1, service_mps2=0.7, margin_m=20.0)
+    least_gap = np.inf
+    for seed, driver in enumerate(DRIVERS):
+        rng = np.random.default_rng(seed)
+        world, x, v = start(rng, 30, params, step, theta)
+        for k in range(int(500 + 200 / step)):
+            targets, limits = joined(behind(world, x, v), ended(world, x)), limits_of(world, x)
+            verdict = supervisor.verdict(params, v, targets, limits, step, theta)
+            a, _ = supervisor.applied(verdict, demanded(driver, rng, k, world, v))
+            assert np.all(verdict.least <= verdict.greatest) and np.all(verdict.least >= -1.1)
+            assert np.all((a >= verdict.least) & (a <= verdict.greatest)) and np.all(a <= params.greatest_mps2)
+            assert np.all(v + a * step >= -1e-12)  # never backwards
+            x, v = moved(x, v, a, step, theta)
+            rows = np.flatnonzero(~world.first)
+            gap = x[rows - 1] - world.length[rows - 1] - x[rows]
+            least_gap = min(least_gap, gap.min())
+            assert gap.min() > params.margin_m - ROUNDING, (driver, k)
+            assert np.all(world.end - x[world.first] > params.margin_m - ROUNDING)
+            now = limits_of(world, x)
+            forced = now.distance <= 0.0
+            assert np.all(v[now.train[forced]] <= now.speed[forced] + ROUNDING), (driver, k)
+    assert least_gap < params.margin_m + 1.0  # the drivers did press
+
+
+@pytest.mark.parametrize(("theta", "step"), CASES)
+def test_without_supervisor_the_same_drivers_collide(theta, step):
+    params = Params(emergency_mps2=1.1)
+    for seed, driver in enumerate(DRIVERS[:4]):
+        rng = np.random.default_rng(seed)
+        world, x, v = start(rng, 30, params, step, theta)
+        worst = np.inf
+        for k in range(500):
+            a = np.clip(demanded(driver, rng, k, world, v), -1.1, 1.0)
+            x, v = moved(x, v, a, step, theta)
+            rows = np.flatnonzero(~world.first)
+            worst = min(worst, (x[rows - 1] - world.length[rows - 1] - x[rows]).min())
+        assert worst < 0.0, driver
+
+
+@pytest.mark.parametrize(("theta", "step"), CASES)
+def test_opposing_trains_never_meet(theta, step):
+    params = Params(mode="on", emergency_mps2=0.9, service_mps2=0.6, margin_m=15.0)
+    for seed, driver in enumerate(DRIVERS):
+        rng = np.random.default_rng(seed)
+        pairs = np.arange(200)
+        v = rng.uniform(0.0, 60.0, 400)
+        way = supervisor.stopping_distance(v, params.emergency_mps2, step, theta)
+        x = np.concatenate([np.zeros(200), way[:200] + way[200:] + 15.0 + rng.choice([0.0, 1.0, 500.0], 200)])
+        world = World(1, np.zeros(400), np.zeros((1, 1)), np.zeros((1, 1)), np.zeros(1))
+        toward = np.where(np.arange(400) < 200, 1.0, -1.0)
+        for k in range(int(300 + 100 / step)):
+            targets = facing(pairs, pairs + 200, x[200:] - x[:200], v)
+            a, _ = supervisor.applied(
+                supervisor.verdict(params, v, targets, supervisor.no_limits(), step, theta), demanded(driver, rng, k, world, v)
+            )
+            way_made, v = moved(np.zeros(400), v, a, step, theta)
+            x = x + toward * way_made
+            assert (x[200:] - x[:200]).min() > 15.0 - ROUNDING, (driver, k)
+        if driver == "full traction":
+            assert (x[200:] - x[:200]).max() < 16.0  # and still they come as near as they may
+
+
+@pytest.mark.parametrize(("theta", "step"), CASES)
+def test_points_are_reached_and_not_passed_and_the_train_starts_again_when_they_go(theta, step):
+    params = Params(mode="on")
+    rng = np.random.default_rng(3)
+    for kind in (STOP, SWITCH, END, TRAIN):
+        v = rng.uniform(0.0, 80.0, 300)
+        at = supervisor.stopping_distance(v, 0.7, step, theta) + rng.choice([0.0, 0.3, 2000.0], 300) + params.margin_m
+        x, rows = np.zeros(300), np.arange(300)
+        keeps = 0.0 if kind == STOP else params.margin_m
+        hardest = 0.0
+        for _ in range(int(400 / step)):
+            verdict = supervisor.verdict(params, v, fixed(rows, at - x, kind), supervisor.no_limits(), step, theta)
+            a, _ = supervisor.applied(verdict, np.full(300, 9.0))
+            hardest = min(hardest, a.min())
+            assert kind != STOP or not verdict.emergency.any()
+            x, v = moved(x, v, a, step, theta)
+            assert np.all(at - x > keeps - ROUNDING)
+        assert np.all(v < 1e-6) and np.all(at - x < keeps + 1e-3), KINDS[kind]
+        assert hardest > (-0.7 if kind == STOP else -1.0) - 1e-6
+        verdict = supervisor.verdict(params, v, supervisor.no_targets(), supervisor.no_limits(), step, theta)
+        assert np.all(verdict.greatest == params.greatest_mps2)
+
+
+@pytest.mark.parametrize(("theta", "step"), CASES)
+def test_a_lower_limit_is_reached_with_the_service_brake_at_its_begin(theta, step):
+    params = Params(mode="on")
+    rng = np.random.default_rng(4)
+    u, v = rng.uniform(0.0, 60.0, 300), rng.uniform(0.0, 80.0, 300)
+    x, rows, at = np.zeros(300), np.arange(300), 9000.0 + rng.uniform(0.0, 50.0, 300)
+    passed = np.full(300, np.nan)
+    for _ in range(int(1200 / step)):
+        verdict = supervisor.verdict(params, v, supervisor.no_targets(), Limits(rows, at - x, u), step, theta)
+        a, _ = supervisor.applied(verdict, np.full(300, 9.0))
+        assert a.min() > -0.7 - 1e-6
+        before, old = x, v
+        x, v = moved(x, v, a, step, theta)
+        crossing = (before <= at + ROUNDING) & (x > at + ROUNDING)
+        assert np.all(old[crossing] <= u[crossing] + ROUNDING) and np.all(v[crossing] <= u[crossing] + ROUNDING)
+        passed[crossing] = old[crossing]
+    there = ~np.isnan(passed)
+    assert there.mean() > 0.9 and np.all(passed[there] > u[there] - 0.7 * step - ROUNDING)  # not slower than it must be
+
+
+@pytest.mark.parametrize(("theta", "step"), CASES)
+def test_the_greatest_acceleration_is_the_greatest_that_is_safe(theta, step):
+    """A little more, and full braking from then on ends within the margin, if the train ahead brakes now."""
+    params = Params(mode="on", greatest_mps2=50.0)
+    rng = np.random.default_rng(5)
+    v, w = rng.uniform(0.0, 70.0, 4000), rng.uniform(0.0, 70.0, 4000) * (rng.random(4000) < 0.8)
+    way = [supervisor.stopping_distance(s, 1.0, step, theta) for s in (v, w)]
+    room = 20.0 + np.maximum(0.0, way[0] - way[1]) + rng.exponential(50.0, 4000)
+    targets = Targets(np.arange(4000), room, w, np.ones(4000, bool), np.full(4000, TRAIN), np.full(4000, -1))
+    greatest = supervisor.verdict(params, v, targets, supervisor.no_limits(), step, theta).greatest
+    for extra, safe in ((0.0, True), (1e-3, False)):
+        at, speed, rear, ahead = np.zeros(4000), v.copy(), room.copy(), w.copy()
+        at, speed = moved(at, speed, greatest + extra, step, theta)
+        rear, ahead = moved(rear, ahead, np.full(4000, -1.0), step, theta)
+        least = rear - at
+        for _ in range(int(400 / step)):
+            at, speed = moved(at, speed, np.full(4000, -1.0), step, theta)
+            rear, ahead = moved(rear, ahead, np.full(4000, -1.0), step, theta)
+            least = np.minimum(least, rear - at)
+        kept = least > 20.0 - 1e-7
+        moves = (v + greatest * step > 0.0) & (greatest < 50.0)
+        assert np.all(kept) if safe else not np.any(kept & moves & (theta > 0.0)) and np.mean(kept[moves]) < 0.05
