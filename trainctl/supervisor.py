@@ -34,7 +34,7 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from trainctl.signals import Bools, Floats, Ints, Table
 
@@ -53,25 +53,28 @@ class Params(Table):
     """Keys of the scenario's [supervisor] table."""
 
     mode: Literal["off", "monitor", "on"] = Field(
-        "off", description="on: bounds every train's acceleration; monitor: reports what it would have done; off"
+        "off", description="on: bounds every train's acceleration; monitor: reports what it would have done, without doing it."
     )
     curve: Literal["relative", "absolute"] = Field(
-        "relative",
-        description="relative: a train ahead itself needs its braking distance; absolute: as if it stood where its rear is",
+        "relative", description="A train ahead is taken to need its braking distance itself, or to stand where its rear is now."
     )
-    emergency_mps2: float = Field(1.0, gt=0.0, description="deceleration every train can give at any speed, and none exceeds")
-    service_mps2: float = Field(0.7, gt=0.0, description="deceleration planned with before lower speed limits and stops")
-    margin_m: float = Field(20.0, ge=0.0, description="kept between a front and what it must not reach; a stop is reached")
-    greatest_mps2: float = Field(1.0, gt=0.0, description="greatest acceleration admitted")
+    emergency_mps2: float = Field(
+        1.0, gt=0.0, description="Deceleration [m/s2] every train can give at any speed, and none is let exceed."
+    )
+    service_mps2: float = Field(
+        0.7, gt=0.0, description="Deceleration [m/s2] planned with before lower speed limits and stops; at most emergency_mps2."
+    )
+    margin_m: float = Field(20.0, ge=0.0, description="Kept between a front and what it must not reach [m]; stops are reached.")
+    greatest_mps2: float = Field(1.0, gt=0.0, description="Greatest acceleration admitted [m/s2].")
     emergency_distance_m: float = Field(
-        0.0, ge=0.0, description="distance to another train below which emergency braking is ordered whatever the speeds"
+        0.0, ge=0.0, description="Gap to another train [m] below which emergency braking is ordered whatever the speeds."
     )
 
-    def violations(self) -> list[str]:
-        """What does not fit together, as ``key = value: rule``."""
+    @model_validator(mode="after")
+    def _rates(self) -> Params:
         if self.service_mps2 > self.emergency_mps2:
-            return [f"supervisor.service_mps2 = {self.service_mps2:g}: at most emergency_mps2 = {self.emergency_mps2:g}"]
-        return []
+            raise ValueError(f"service_mps2 = {self.service_mps2:g}: at most emergency_mps2 = {self.emergency_mps2:g}")
+        return self
 
 
 class Targets(NamedTuple):

@@ -52,17 +52,21 @@ def joined(*parts: Targets) -> Targets:
     return Targets(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def demanded(driver: str, rng: np.random.Generator, k: int, world: World, v: np.ndarray) -> np.ndarray:
-    n = len(v)
-    if driver == "random":
-        return rng.uniform(-3.0, 3.0, n)
-    if driver == "bang-bang":  # each train holds full traction or full braking for some steps
-        return np.where(np.sin(0.01 * (1 + np.arange(n) % 17) * k + np.arange(n)) > -0.3, 9.0, -9.0)
-    if driver == "against the follower":  # every other train goes and stops dead, the rest press on
-        return np.where(np.arange(n) % 2 == 0, np.where(k // 150 % 2 == 0, 9.0, -9.0), 9.0)
-    if driver == "no numbers":
-        return rng.choice([np.nan, np.inf, np.inf, np.inf, -np.inf], n)
-    return np.full(n, 9.0)
+def demanded(rng: np.random.Generator, k: int, n: int) -> np.ndarray:
+    """Acceleration of every train: the trains fall into equal shares, one for each driver."""
+    i = np.arange(n)
+    by = [
+        rng.uniform(-3.0, 3.0, n),
+        np.where(np.sin(0.01 * (1 + i % 17) * k + i) > -0.3, 9.0, -9.0),  # full traction or braking, held for some steps
+        np.full(n, 9.0),
+        np.where((i % 2 == 0) & (k // 150 % 2 == 1), -9.0, 9.0),  # every other train goes and stops dead, the rest press on
+        rng.choice([np.nan, np.inf, np.inf, np.inf, -np.inf], n),
+    ]
+    return np.choose(shares(n), by)
+
+
+def shares(n: int) -> np.ndarray:
+    return np.arange(n) * len(DRIVERS) // n
 
 
 def moved(x: np.ndarray, v: np.ndarray, a: np.ndarray, step: float, theta: float) -> tuple[np.ndarray, np.ndarray]:
@@ -108,69 +112,82 @@ def ended(world: World, x: np.ndarray) -> Targets:
 CASES = [(0.0, 0.2), (0.5, 0.2), (0.0, 1.0), (0.5, 1.0), (0.0, 2.0), (0.5, 0.7), (0.25, 0.5)]
 
 
+def driven(seed: int, columns: int, params: Params, step: float, theta: float, seconds: float) -> float:
+    """Least distance to the train ahead in a run of all drivers; every step is checked."""
+    rng = np.random.default_rng(seed)
+    world, x, v = start(rng, columns, params, step, theta)
+    rows, least_gap = np.flatnonzero(~world.first), np.inf
+    for k in range(int(seconds / step)):
+        targets, limits = joined(behind(world, x, v), ended(world, x)), limits_of(world, x)
+        verdict = supervisor.verdict(params, v, targets, limits, step, theta)
+        a, _ = supervisor.applied(verdict, demanded(rng, k, len(v)))
+        assert np.all(verdict.least <= verdict.greatest) and np.all(verdict.least >= -params.emergency_mps2)
+        assert np.all((a >= verdict.least) & (a <= verdict.greatest)) and np.all(a <= params.greatest_mps2)
+        assert np.all(v + a * step >= -1e-12)  # never backwards
+        x, v = moved(x, v, a, step, theta)
+        gap = x[rows - 1] - world.length[rows - 1] - x[rows]
+        least_gap = min(least_gap, gap.min())
+        assert gap.min() > params.margin_m - ROUNDING, (k, DRIVERS[shares(len(v))[rows[gap.argmin()]]])
+        assert np.all(world.end - x[world.first] > params.margin_m - ROUNDING)
+        now = limits_of(world, x)
+        forced = now.distance <= 0.0
+        assert np.all(v[now.train[forced]] <= now.speed[forced] + ROUNDING), k
+    return least_gap
+
+
 @pytest.mark.parametrize("curve", ["relative", "absolute"])
 @pytest.mark.parametrize(("theta", "step"), CASES)
 def test_columns_under_any_driver_keep_the_margin_and_the_limits(theta, step, curve):
     params = Params(mode="on", curve=curve, emergency_mps2=1.1, service_mps2=0.7, margin_m=20.0)
-    least_gap = np.inf
-    for seed, driver in enumerate(DRIVERS):
-        rng = np.random.default_rng(seed)
-        world, x, v = start(rng, 30, params, step, theta)
-        for k in range(int(500 + 200 / step)):
-            targets, limits = joined(behind(world, x, v), ended(world, x)), limits_of(world, x)
-            verdict = supervisor.verdict(params, v, targets, limits, step, theta)
-            a, _ = supervisor.applied(verdict, demanded(driver, rng, k, world, v))
-            assert np.all(verdict.least <= verdict.greatest) and np.all(verdict.least >= -1.1)
-            assert np.all((a >= verdict.least) & (a <= verdict.greatest)) and np.all(a <= params.greatest_mps2)
-            assert np.all(v + a * step >= -1e-12)  # never backwards
-            x, v = moved(x, v, a, step, theta)
-            rows = np.flatnonzero(~world.first)
-            gap = x[rows - 1] - world.length[rows - 1] - x[rows]
-            least_gap = min(least_gap, gap.min())
-            assert gap.min() > params.margin_m - ROUNDING, (driver, k)
-            assert np.all(world.end - x[world.first] > params.margin_m - ROUNDING)
-            now = limits_of(world, x)
-            forced = now.distance <= 0.0
-            assert np.all(v[now.train[forced]] <= now.speed[forced] + ROUNDING), (driver, k)
-    assert least_gap < params.margin_m + 1.0  # the drivers did press
+    assert driven(1, 100, params, step, theta, 300.0) < params.margin_m + 1.0  # the drivers did press
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("curve", ["relative", "absolute"])
+@pytest.mark.parametrize("seed", range(10))
+def test_columns_keep_the_margin_in_long_runs(seed, curve):
+    rng = np.random.default_rng(100 + seed)
+    step, theta = float(rng.uniform(0.2, 2.0)), float(rng.choice([0.0, 0.5]))
+    emergency = float(rng.uniform(0.4, 2.0))
+    params = Params(
+        mode="on", curve=curve, emergency_mps2=emergency, service_mps2=float(rng.uniform(0.3, 1.0)) * emergency,
+        margin_m=float(rng.uniform(0.0, 40.0)), greatest_mps2=float(rng.uniform(0.3, 2.0)),
+    )  # fmt: skip
+    driven(seed, 1000, params, step, theta, 3000.0 * step)
 
 
 @pytest.mark.parametrize(("theta", "step"), CASES)
 def test_without_supervisor_the_same_drivers_collide(theta, step):
     params = Params(emergency_mps2=1.1)
-    for seed, driver in enumerate(DRIVERS[:4]):
-        rng = np.random.default_rng(seed)
-        world, x, v = start(rng, 30, params, step, theta)
-        worst = np.inf
-        for k in range(500):
-            a = np.clip(demanded(driver, rng, k, world, v), -1.1, 1.0)
-            x, v = moved(x, v, a, step, theta)
-            rows = np.flatnonzero(~world.first)
-            worst = min(worst, (x[rows - 1] - world.length[rows - 1] - x[rows]).min())
-        assert worst < 0.0, driver
+    rng = np.random.default_rng(1)
+    world, x, v = start(rng, 100, params, step, theta)
+    rows, worst = np.flatnonzero(~world.first), np.full(len(v), np.inf)
+    for k in range(int(200.0 / step)):
+        a = np.clip(np.nan_to_num(demanded(rng, k, len(v))), -1.1, 1.0)
+        x, v = moved(x, v, a, step, theta)
+        worst[rows] = np.minimum(worst[rows], x[rows - 1] - world.length[rows - 1] - x[rows])
+    for share, driver in enumerate(DRIVERS):
+        assert worst[shares(len(v)) == share].min() < 0.0, driver
 
 
 @pytest.mark.parametrize(("theta", "step"), CASES)
-def test_opposing_trains_never_meet(theta, step):
+def test_opposing_trains_never_meet_and_come_as_near_as_they_may(theta, step):
     params = Params(mode="on", emergency_mps2=0.9, service_mps2=0.6, margin_m=15.0)
-    for seed, driver in enumerate(DRIVERS):
-        rng = np.random.default_rng(seed)
-        pairs = np.arange(200)
-        v = rng.uniform(0.0, 60.0, 400)
-        way = supervisor.stopping_distance(v, params.emergency_mps2, step, theta)
-        x = np.concatenate([np.zeros(200), way[:200] + way[200:] + 15.0 + rng.choice([0.0, 1.0, 500.0], 200)])
-        world = World(1, np.zeros(400), np.zeros((1, 1)), np.zeros((1, 1)), np.zeros(1))
-        toward = np.where(np.arange(400) < 200, 1.0, -1.0)
-        for k in range(int(300 + 100 / step)):
-            targets = facing(pairs, pairs + 200, x[200:] - x[:200], v)
-            a, _ = supervisor.applied(
-                supervisor.verdict(params, v, targets, supervisor.no_limits(), step, theta), demanded(driver, rng, k, world, v)
-            )
-            way_made, v = moved(np.zeros(400), v, a, step, theta)
-            x = x + toward * way_made
-            assert (x[200:] - x[:200]).min() > 15.0 - ROUNDING, (driver, k)
-        if driver == "full traction":
-            assert (x[200:] - x[:200]).max() < 16.0  # and still they come as near as they may
+    rng = np.random.default_rng(0)
+    pairs = np.arange(500)
+    v = rng.uniform(0.0, 60.0, 1000)
+    way = supervisor.stopping_distance(v, params.emergency_mps2, step, theta)
+    apart = way[:500] + way[500:] + 15.0 + rng.choice([0.0, 1.0, 500.0], 500)
+    drivers = np.argsort(np.tile(pairs, 2), kind="stable")  # a pair has one driver
+    for k in range(int(400 / step)):
+        verdict = supervisor.verdict(params, v, facing(pairs, pairs + 500, apart, v), supervisor.no_limits(), step, theta)
+        wanted = np.empty(1000)
+        wanted[drivers] = demanded(rng, k, 1000)
+        a, _ = supervisor.applied(verdict, wanted)
+        made, v = moved(np.zeros(1000), v, a, step, theta)
+        apart = apart - made[:500] - made[500:]
+        assert apart.min() > 15.0 - ROUNDING, k
+    assert apart[DRIVERS.index("full traction") * 100 :][:100].max() < 16.0
 
 
 @pytest.mark.parametrize(("theta", "step"), CASES)
