@@ -53,7 +53,7 @@ def random_traffic(rng, railway, n):
 
 
 def joining(railway, traffic, order, horizon, i):
-    """All trains over other tracks that are ahead of ``i``: train, spacing, distance to the join."""
+    """All trains over other tracks that are ahead of ``i``: train, spacing, distance to the join; whether it is the next."""
     ways, row, s, _, present = traffic
     rank = {(int(e), int(j)): int(r) for e, j, r in zip(*order, strict=True)}
 
@@ -66,18 +66,24 @@ def joining(railway, traffic, order, horizon, i):
                 seen.add(e)
 
     for k, e, turn in approaches(i):
-        for j in np.flatnonzero(present).tolist():
+        found = []
+        for j in set(np.flatnonzero(present).tolist()) - {i}:
             for m, f, other in approaches(j):
-                joins = f == e and ways.edge[k - 1] != ways.edge[m - 1]
+                same = ways.edge[k - 1] == ways.edge[m - 1]
                 apart = ways.edge[row[j]] not in ways.edge[row[i] : k] and ways.edge[row[i]] not in ways.edge[row[j] : m]
-                if j != i and joins and apart and other < turn:
-                    yield j, turn[1] - other[1], turn[1]
+                if f == e and other < turn and (same or apart):
+                    found.append((other, not same, j))
+        decided = [entry for entry in found if entry[0][0] < np.inf]
+        for entry in found:
+            other, comes_over_another, j = entry
+            if comes_over_another:
+                yield j, turn[1] - other[1], turn[1], entry not in decided or entry == max(decided)
 
 
 def nearest_ahead(railway, traffic, order, horizon, i):
     ways, row, s, _, present = traffic
     x = s - ways.begin[row]
-    found = [spacing for _, spacing, _ in joining(railway, traffic, order, horizon, i)]
+    found = [spacing for _, spacing, _, is_next in joining(railway, traffic, order, horizon, i) if is_next]
     for k in range(row[i], ways.first[i + 1]):
         for j in np.flatnonzero(present & (ways.edge[row] == ways.edge[k])).tolist():
             spacing = ways.begin[k] + x[j] - s[i]
@@ -116,7 +122,7 @@ def blocked(railway, traffic, order, horizon, virtual, i):
                     yield away + size - min(depth, size), j, -1
                 if f in railway.crossing[e] and deeper:
                     yield away, j, 0
-    for j, spacing, distance in joining(railway, traffic, order, horizon, i):
+    for j, spacing, distance, _ in joining(railway, traffic, order, horizon, i):
         yield (spacing - length[j], j, 1) if virtual else (distance, j, 0)
 
 

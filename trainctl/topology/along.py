@@ -203,8 +203,9 @@ def ahead(places: Places) -> Ahead:
     -----
     Ahead is a train whose front is on the way, also if its own way branches off later, and one that still comes over another track
     and joins: its distance to the edge where it joins is smaller (ties by number), or its turn was decided to be earlier. Its
-    spacing is the difference of the distances, so it can be negative where the turn was decided against the distances. Two trains
-    of which one stands on the way of the other before they part and join again keep the order they stand in.
+    spacing is the difference of the distances, so it can be negative where the turn was decided against the distances. Where turns
+    are decided, only the last before the own counts, not the nearest. Two trains of which one stands on the way of the other before
+    they part and join again keep the order they stand in.
 
     The train behind is the inverse where it is unique, see ``behind``: two trains may have the same one ahead, on two tracks before
     a join or where one ahead of both will branch off.
@@ -330,14 +331,14 @@ def _comes_over_another_track(places: Places, i: int, k: int, j: int, m: int) ->
 
 
 @njit(cache=True)
-def _joining(places: Places, i: int, best: float, lengths: bool) -> tuple[int, float, float]:
+def _joining(places: Places, i: int, best: float, lengths: bool) -> tuple[int, float]:
     """Nearest train that comes over another track and is ahead of ``i``, nearer than ``best``.
 
-    Returns the train or -1, its spacing (less its length, if ``lengths``) [m] and the distance of ``i`` to where it joins [m].
+    Returns the train or -1 and its spacing [m]. With ``lengths`` the nearest rear, and the spacing less the length.
     """
     begin, s = places.ways.begin, places.s
     slack = places.longest if lengths else 0.0
-    found, joins_at = -1, np.inf
+    found = -1
     for q in range(places.own_first[i], places.own_first[i + 1]):
         own = places.own[q]
         k = places.join_row[own]
@@ -355,10 +356,14 @@ def _joining(places: Places, i: int, best: float, lengths: bool) -> tuple[int, f
                 p = decided - 1
                 continue
             value = spacing - places.length[j] if lengths else spacing
-            if j != i and value < best and _comes_over_another_track(places, i, k, j, m):
-                found, best, joins_at = j, value, distance
+            over_another = j != i and _comes_over_another_track(places, i, k, j, m)
+            if over_another and value < best:
+                found, best = j, value
+            same_track = places.ways.edge[k - 1] == places.ways.edge[m - 1]
+            if p < decided and j != i and not lengths and (over_another or same_track):
+                break  # the last turn before the own; who goes before that one is not the next ahead
             p -= 1
-    return found, best, joins_at
+    return found, best
 
 
 @njit(cache=True)
@@ -382,7 +387,7 @@ def _ahead(places: Places, train: Ints, spacing: Floats) -> None:
                     if away + places.depth[p] <= places.horizon:
                         found, best = j, away + places.depth[p]
                     break
-        j, value, _ = _joining(places, i, best, False)
+        j, value = _joining(places, i, best, False)
         if j >= 0:
             found, best = j, value
         train[i], spacing[i] = found, best
@@ -435,7 +440,7 @@ def _obstacles(places: Places, virtual: bool, room: Floats, train: Ints, sense: 
         if best > places.horizon:
             found, best, way = -1, np.inf, 0
         if virtual:
-            j, value, _ = _joining(places, i, best, True)
+            j, value = _joining(places, i, best, True)
             if j >= 0:
                 found, best, way = j, value, 1
         else:
