@@ -14,16 +14,18 @@ d           distance from the front to the point, less the margin [m]
 
 Notes
 -----
-Why no train reaches its point, by induction over the steps. A state is *safe* if full braking of all from now on ends well.
+Why no train reaches its point, by induction over the steps. A state is *safe* if full braking of all trains from now on ends with
+no margin touched: before a fixed point ``d >= D(v)``, behind a moving train ``d >= D(v) - D(w)``, against an opposing one
+``d >= D(v) + D(w)``.
 
-1. Full braking for one step takes ``D(v) - D(v')``, so a safe state stays safe under it. Way and D grow with the speed: of two
-   trains braking with b the faster one makes the longer way in every step until both stand. The gap between them is least either
-   now or then, so safe behind a moving train means ``d >= max(0, D(v) - D(w))``; behind a fixed point it means ``d >= D(v)``,
-   against an opposing train ``d >= D(v) + D(w)``.
-2. ``verdict`` takes the greatest v' that is safe after the step for the least the others can do: the train ahead brakes with b,
-   it cannot brake harder (``least``); of two opposing trains each takes half of ``d - D(v) - D(w)`` for itself at most. Whatever
-   more the train ahead does adds to the distances, because its way and D(w') grow with w'.
-3. That v' exists in a safe state: full braking. So a safe start stays safe, whatever is demanded; and v' is the greatest such.
+1. Full braking for one step takes ``D(v) - D(v')``, so a safe state stays safe under it, and there always is a safe choice.
+   ``verdict`` takes the greatest v' that is safe after the step for the least the others can do: the train ahead brakes with b,
+   it cannot brake harder (``least``); of two opposing trains each takes half of ``d - D(v) - D(w)`` for itself at most.
+   Whatever more the train ahead does only adds, because its way and D(w') grow with w'. So a safe state stays safe, whatever
+   is demanded.
+2. Nothing is missed on the way to the end. Behind a train ahead with v' >= w', safety says ``d' >= D(v') - D(w') >= 0``. If
+   v' < w' even when the train ahead brakes fully, then v < w too, because no train brakes harder than b: the lower speed before
+   and after, so the gap grew. Hence no gap falls below the margin, and one that began below it does not shrink.
 
 Holding the speed v behind a train of the same speed therefore needs v T beyond the margin: the train ahead may begin to brake
 now, its follower learns of it one step later.
@@ -168,8 +170,8 @@ def speed_after(room: Floats, target_speed: Floats, speed: Floats, b: float, ste
 def verdict(params: Params, speed: Floats, targets: Targets, limits: Limits, step_s: float, theta: float) -> Verdict:
     """Judge what every train may do over the coming step; the rule and its proof are in the notes of the module.
 
-    Points are kept clear of by braking with ``emergency_mps2``. Lower limits and stops are braked for with ``service_mps2``; where
-    that does not suffice any more, with up to ``emergency_mps2`` from the last moment on.
+    Points are kept clear of by braking with ``emergency_mps2``. Lower limits and stops are braked for with ``service_mps2``;
+    where that does not suffice any more, with up to ``emergency_mps2`` from the last moment on.
 
     Parameters
     ----------
@@ -216,13 +218,6 @@ def _before_targets(params: Params, speed: Floats, targets: Targets, step: float
     to_stop = np.where(follows, room + other, np.where(opposing & targets.moving, 0.5 * (room + own - other), room))
     after = speed_after(to_stop, np.zeros(len(v)), v, b, step, theta)
     late = to_stop < own - _LENGTH
-
-    # Behind a train that is faster than its follower the gap is least after this very step, not when both stand.
-    its_way = other - stopping_distance(np.maximum(targets.speed - b * step, 0.0), b, step, theta)
-    near = room + its_way - (1.0 - theta) * v * step
-    if theta > 0.0:
-        after = np.where(follows, np.minimum(after, near / (theta * step)), after)
-    late |= follows & (near < -_LENGTH)
     late |= (a_train | opposing) & (targets.room < params.emergency_distance_m)
 
     rate = (after - v) / step

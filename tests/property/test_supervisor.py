@@ -142,6 +142,26 @@ def test_columns_under_any_driver_keep_the_margin_and_the_limits(theta, step, cu
     assert driven(1, 100, params, step, theta, 300.0) < params.margin_m + 1.0  # the drivers did press
 
 
+@pytest.mark.parametrize(("theta", "step"), CASES)
+def test_a_gap_that_begins_below_the_margin_behind_a_faster_train_does_not_shrink(theta, step):
+    params, rng = Params(mode="on"), np.random.default_rng(2)
+    v, w = rng.uniform(0.0, 30.0, 500), rng.uniform(30.0, 60.0, 500)
+    gap = rng.uniform(0.0, 20.0, 500)
+    least, rows = np.minimum(gap, 20.0), np.arange(500)
+    enough = supervisor.stopping_distance(w, 1.0, step, theta) - supervisor.stopping_distance(v, 1.0, step, theta) + gap >= 20.0
+    for k in range(int(150 / step)):
+        ahead = Targets(rows, gap, w, np.ones(500, bool), np.full(500, TRAIN), np.full(500, -1))
+        verdict = supervisor.verdict(params, v, ahead, supervisor.no_limits(), step, theta)
+        a, _ = supervisor.applied(verdict, np.full(500, 9.0))
+        its_way, w = moved(
+            np.zeros(500), w, np.where(k > 20, -1.0, np.nan_to_num(demanded(rng, k, 500)).clip(-1.0, 1.0)), step, theta
+        )
+        own_way, v = moved(np.zeros(500), v, a, step, theta)
+        gap = gap + its_way - own_way
+        assert np.all((gap >= least - ROUNDING)[enough])
+        least = np.maximum(least, np.minimum(gap, 20.0))
+
+
 @pytest.mark.campaign
 @pytest.mark.parametrize("curve", ["relative", "absolute"])
 @pytest.mark.parametrize("seed", range(10))
