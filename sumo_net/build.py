@@ -46,15 +46,26 @@ def build(spec: LineSpec, folder: str | Path) -> Path:
 
 
 def netconvert() -> tuple[Path, dict[str, str]]:
-    """SUMO's net builder and the environment it needs: the one of the eclipse-sumo wheel, else that of the PATH."""
+    """SUMO's net builder and the environment it needs."""
+    return program("netconvert")
+
+
+def program(name: str) -> tuple[Path, dict[str, str]]:
+    """One of SUMO's programs and the environment it needs: that of the eclipse-sumo wheel, else that of the PATH.
+
+    Raises
+    ------
+    LineError
+        If there is none.
+    """
     try:
         from sumo import SUMO_HOME
     except ImportError:
-        found = shutil.which("netconvert")
+        found = shutil.which(name)
         if found is None:
-            raise LineError(["netconvert: not found; install eclipse-sumo, or put SUMO's bin folder on the PATH"]) from None
+            raise LineError([f"{name}: not found; install eclipse-sumo, or put SUMO's bin folder on the PATH"]) from None
         return Path(found), dict(os.environ)
-    return Path(SUMO_HOME) / "bin" / "netconvert", os.environ | {"SUMO_HOME": SUMO_HOME}
+    return Path(SUMO_HOME) / "bin" / name, os.environ | {"SUMO_HOME": SUMO_HOME}
 
 
 def _convert(name: str, folder: Path) -> None:

@@ -1,0 +1,601 @@
+"""The trains of a SUMO configuration, every one of them known before the run.
+
+``duarouter`` expands flows into trains, trips into routes, and draws from distributions. It is handed routes, stops and times
+alone: it leaves out trains with a ``line`` without a word, so everything else is taken from the files and joined by id.
+"""
+
+from __future__ import annotations
+
+import gzip
+import re
+import subprocess
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+from sumo_net.build import program
+from sumo_net.netfile import RAIL
+from sumo_net.spec import LineError
+from trainctl.errors import InputError
+from trainctl.scenario import TrainType
+
+#: Seconds after which duarouter is taken for stuck.
+PATIENCE_S = 300.0
+
+#: Length [m] and greatest speed [m/s] of SUMO's vehicle classes.
+_CLASS = {
+    "rail": (135.0, 160 / 3.6), "rail_electric": (200.0, 220 / 3.6), "rail_fast": (200.0, 330 / 3.6),
+    "rail_urban": (109.5, 100 / 3.6),
+    "tram": (22.0, 80 / 3.6), "subway": (109.5, 100 / 3.6), "cable_car": (5.0, 200 / 3.6),
+}  # fmt: skip
+
+#: The same of the train types of SUMO's Rail model.
+_RAIL_MODEL = {
+    "NGT400": (200.0, 500 / 3.6), "NGT400_16": (200.0, 430 / 3.6), "ICE1": (358.0, 250 / 3.6), "ICE3": (200.0, 300 / 3.6),
+    "REDosto7": (207.0, 160 / 3.6), "RB425": (67.5, 160 / 3.6), "RB628": (46.0, 120 / 3.6), "Freight": (512.0, 120 / 3.6),
+    "MireoPlusB": (46.56, 160 / 3.6), "MireoPlusH": (46.56, 160 / 3.6), "custom": (100.0, 200 / 3.6),
+}  # fmt: skip
+
+#: What SUMO calls one thing: the places a train can stop at.
+_PLACES = ("trainStop", "busStop", "containerStop", "parkingArea", "chargingStation", "overheadWireSegment")
+_OPTIONS = {
+    "n": "net-file", "net": "net-file", "r": "route-files", "routes": "route-files", "a": "additional-files",
+    "additional": "additional-files", "b": "begin", "e": "end",
+}  # fmt: skip
+_TRAINS = ("vehicle", "trip", "flow")
+_PEOPLE = {"person": "persons", "personFlow": "persons", "container": "containers", "containerFlow": "containers"}
+#: What duarouter needs of a train, a route and a stop.
+_ROUTED = {
+    "id", "type", "depart", "begin", "end", "period", "number", "vehsPerHour", "perHour", "probability", "route", "from", "to",
+    "via", "fromJunction", "toJunction", "viaJunctions",
+}  # fmt: skip
+_ROUTE = {"id", "edges", "probability", "repeat", "cycleTime", "refId"}
+_STOP = {"lane", "edge", "startPos", "endPos", "friendlyPos", "duration", "until", *_PLACES}
+#: What a stop may say that changes nothing here.
+_SILENT = {"line", "tripId", "actType", "color", "name", "arrival", "started", "ended", "posLat", "index", "lane", "parking"}
+
+
+class Stop(NamedTuple):
+    """Where a train waits."""
+
+    edge: str
+    position_m: float  # its front, from the beginning of the edge
+    duration_s: float  # at least
+    until_s: float | None  # not before
+    name: str  # of the train stop, or ""
+
+
+class Departure(NamedTuple):
+    """A train as SUMO would let it in."""
+
+    id: str
+    kind: str  # its vType
+    depart_s: float
+    edges: tuple[str, ...]  # its route, without internal edges
+    position_m: float  # of its front on the first edge
+    speed_mps: float | None  # None: as fast as allowed
+    stops: tuple[Stop, ...]
+    arrival_m: float | None  # where on the last edge it leaves; None: at its end
+    line: str
+
+
+class Kind(NamedTuple):
+    """A vType."""
+
+    id: str
+    vclass: str
+    length_m: float
+    max_speed_mps: float
+    speed_factor: float
+    attributes: dict[str, str]  # all attributes and params
+
+
+class Traffic(NamedTuple):
+    """The trains of a configuration."""
+
+    net: Path
+    departures: tuple[Departure, ...]  # by time, then as in the files
+    kinds: dict[str, Kind]
+    begin_s: float
+    end_s: float | None
+    step_s: float
+    notes: tuple[str, ...]  # what is not followed
+
+
+class _Tracks(NamedTuple):
+    """What a net says of connections."""
+
+    length: dict[str, float]  # of lanes [m]
+    onward: dict[str, set[str]]  # from each edge
+
+
+class _Place(NamedTuple):
+    lane: str
+    position_m: float
+    wrong: str
+
+
+class _Demand(NamedTuple):
+    """The files of a configuration, sorted by kind."""
+
+    types: dict[str, Element]
+    mixes: dict[str, Element]
+    routes: dict[str, Element]
+    drawn: dict[str, Element]  # route distributions
+    trains: list[Element]
+    places: dict[str, Element]
+    seen: dict[str, int]  # how many persons, containers, rerouters
+
+
+def read_traffic(sumocfg: Path, work: Path, end_s: float | None = None, seed: int = 42) -> Traffic:
+    """What a SUMO configuration says of its trains.
+
+    Parameters
+    ----------
+    sumocfg : Path
+        The configuration; the files it names lie relative to its folder.
+    work : Path
+        Folder for what ``duarouter`` reads and writes; made if it is not there.
+    end_s : float, optional
+        Departures from this time on are of no interest [s]; the configuration's own end holds as well.
+    seed : int
+        Of all that is drawn: the same seed gives the same trains.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or is not what it should be, or trains, routes and stops do not fit the net: one line for each.
+    """
+    options = _options(sumocfg)
+    net, routes, more = (_files(sumocfg, options, key) for key in ("net-file", "route-files", "additional-files"))
+    wrong = [f"{sumocfg}: no {key}" for key, files in (("net-file", net), ("route-files", routes)) if not files]
+    wrong += [f"{sumocfg}: {path}: no such file" for path in (*net, *routes, *more) if not path.is_file()]
+    times = {}
+    for key, missing in (("begin", "0"), ("end", "-1"), ("step-length", "1")):
+        try:
+            times[key] = _seconds(options.get(key, missing))
+        except ValueError:
+            wrong.append(f"{sumocfg}: {key} = {options[key]}: must be a time")
+    if wrong:
+        raise InputError(wrong)
+    begin, own_end = times["begin"], times["end"] if times["end"] >= 0 else None
+    ends = [e for e in (own_end, end_s) if e is not None]
+    tracks = _tracks(net[0])
+    demand = _demand([*more, *routes])
+    kinds = {name: _kind(element) for name, element in demand.types.items()}
+    trains, notes = _rail(demand, kinds)
+    _refuse(sumocfg, trains, demand, kinds, tracks)
+    expanded = _expand(trains, demand, net[0], work, begin, min(ends) if ends else None, seed)
+    order = {train.get("id", ""): k for k, train in enumerate(trains)}
+    departures, wrong = [], []
+    for vehicle in expanded:
+        name = vehicle.get("id", "")
+        source = trains[order[name if name in order else name.rpartition(".")[0]]]
+        kind = kinds[vehicle.get("type", "DEFAULT_VEHTYPE")]
+        if kind.vclass not in RAIL:
+            continue
+        train, mistakes = _departure(vehicle, source, kind, demand, tracks)
+        departures.append((order[source.get("id", "")], train))
+        wrong += mistakes
+    if wrong:
+        raise InputError(list(dict.fromkeys(wrong)))
+    if not departures:
+        raise InputError(f"{sumocfg}: no train departs between begin = {begin:g} and end = {min(ends) if ends else -1:g}")
+    departures.sort(key=lambda d: (d[1].depart_s, d[0]))
+    used = {d.kind for _, d in departures}
+    return Traffic(
+        net=net[0],
+        departures=tuple(d for _, d in departures),
+        kinds={name: kind for name, kind in kinds.items() if name in used},
+        begin_s=begin,
+        end_s=own_end,
+        step_s=times["step-length"],
+        notes=tuple(notes),
+    )
+
+
+def train_type(kind: Kind) -> TrainType | list[str]:
+    """Physical data of a vType with SUMO's Rail model and constants of its own; else what it lacks, one line.
+
+    Notes
+    -----
+    SUMO's Rail model takes ``maxPower`` in kW, ``maxTraction`` and ``resCoef_*`` in kN with speeds in m/s, ``mass`` in kg; the
+    traction is the smaller of ``maxTraction`` and ``maxPower`` over the speed, ``decel`` is braking effort over inertia. The train
+    types built into SUMO are tables of speed and force, which no key of ours can hold.
+    """
+    value = {
+        key: kind.attributes[key]
+        for key in ("mass", "maxPower", "maxTraction", "resCoef_constant", "resCoef_linear", "resCoef_quadratic")
+        if key in kind.attributes
+    }
+    model, base = kind.attributes.get("carFollowModel", "Krauss"), kind.attributes.get("trainType", "NGT400")
+    if model != "Rail":
+        value = {"mass": value["mass"]} if "mass" in value else {}  # any other model takes no notice of them
+    lacking = [f"no {key}" for key in ("mass", "maxPower", "maxTraction", "resCoef_constant", "resCoef_linear", "resCoef_quadratic")
+               if key not in value]  # fmt: skip
+    cure = (
+        f'add [train_type.{kind.id}] to the scenario, or carFollowModel="Rail", trainType="custom" with mass (kg), maxPower (kW), '
+    )
+    cure += "maxTraction (kN), resCoef_constant, resCoef_linear, resCoef_quadratic (kN) to the vType"
+    if lacking:
+        built = f" (trainType {base} is a table inside SUMO)" if model == "Rail" and base != "custom" else ""
+        return [f"vType {kind.id}: {', '.join(lacking)}{built}: {cure}"]
+    try:
+        mass, power, traction, c0, c1, c2 = (float(value[key]) for key in value)
+        factor = float(kind.attributes.get("massFactor", "1.08" if base == "custom" else "1.04"))
+        decel = float(kind.attributes.get("decel", "1.0"))
+        return TrainType(
+            unit_length_m=kind.length_m,
+            unit_mass_kg=mass,
+            rotating_mass_factor=factor,
+            c0_n_per_kg=1e3 * c0 / mass,
+            c1_ns_per_m_kg=1e3 * c1 / mass,
+            c2_ns2_per_m2_kg=1e3 * c2 / mass,
+            traction_n=1e3 * traction,
+            traction_power_w=1e3 * power,
+            braking_n=decel * mass * factor,
+        )
+    except (ValueError, ZeroDivisionError) as error:
+        return [f"vType {kind.id}: its data make no train: {' '.join(str(error).split())}"]
+
+
+def _seconds(text: str) -> float:
+    """A time as SUMO writes it: seconds, or [days:]hours:minutes:seconds."""
+    value = 0.0
+    for part, base in zip(text.split(":"), (1.0, *((24.0,) if text.count(":") == 3 else ()), 60.0, 60.0), strict=False):
+        value = value * base + float(part)
+    return value
+
+
+def _parse(path: Path) -> Element:
+    try:
+        content = path.read_bytes()
+        return ElementTree.fromstring(gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content)
+    except OSError as error:
+        raise InputError(f"{path}: {'no such file' if isinstance(error, FileNotFoundError) else error.strerror}") from None
+    except (ElementTree.ParseError, EOFError, ValueError) as error:
+        raise InputError(f"{path}: not XML: {error}") from None
+
+
+def _options(sumocfg: Path) -> dict[str, str]:
+    root = _parse(sumocfg)
+    if root.tag not in ("configuration", "sumoConfiguration"):
+        raise InputError(f"{sumocfg}: not a SUMO configuration: it begins with <{root.tag}>, not <sumoConfiguration>")
+    found = {
+        _OPTIONS.get(e.tag, e.tag): e.get("value", e.get("v", "")) for e in root.iter() if e.get("value", e.get("v")) is not None
+    }
+    return found
+
+
+def _files(sumocfg: Path, options: dict[str, str], key: str) -> list[Path]:
+    return [sumocfg.parent / name.strip() for name in re.split(r"[,;]", options.get(key, "")) if name.strip()]
+
+
+def _tracks(net: Path) -> _Tracks:
+    root = _parse(net)
+    if root.tag != "net":
+        raise InputError(f"{net}: not a SUMO net: it begins with <{root.tag}>, not <net>")
+    length = {lane.get("id", ""): float(lane.get("length", "0")) for lane in root.iter("lane")}
+    onward: dict[str, set[str]] = {edge.get("id", ""): set() for edge in root.iter("edge")}
+    for c in root.iter("connection"):
+        onward.setdefault(c.get("from", ""), set()).add(c.get("to", ""))
+    return _Tracks(length, onward)
+
+
+def _elements(path: Path) -> Iterator[Element]:
+    """What a file says at its top, with the files it includes."""
+    for element in _parse(path):
+        if element.tag == "include":
+            yield from _elements(path.parent / element.get("href", ""))
+        else:
+            yield element
+
+
+def _demand(files: list[Path]) -> _Demand:
+    d = _Demand({"DEFAULT_VEHTYPE": Element("vType", id="DEFAULT_VEHTYPE"),
+                 "DEFAULT_RAILTYPE": Element("vType", id="DEFAULT_RAILTYPE", vClass="rail")}, {}, {}, {}, [], {}, {})  # fmt: skip
+    named = {"vType": d.types, "vTypeDistribution": d.mixes, "route": d.routes, "routeDistribution": d.drawn}
+    for path in files:
+        for element in _elements(path):
+            tag, name = element.tag, element.get("id", "")
+            if tag in _TRAINS:
+                d.trains.append(element)
+            elif tag in named:
+                named[tag][name] = element
+                d.types.update({e.get("id", ""): e for e in element.iter("vType")})
+                d.routes.update({e.get("id", ""): e for e in element.iter("route") if e.get("id") and e.get("edges")})
+            elif tag in _PLACES:
+                d.places[name] = element
+            elif tag in _PEOPLE or tag == "rerouter":
+                d.seen[tag] = d.seen.get(tag, 0) + 1
+    return d
+
+
+def _kind(element: Element) -> Kind:
+    said = dict(element.attrib) | {p.get("key", ""): p.get("value", "") for p in element.iter("param")}
+    for child in element:  # the old way: <carFollowing-Rail trainType="..."/>
+        if child.tag.startswith("carFollowing-"):
+            said |= {"carFollowModel": child.tag.partition("-")[2], **child.attrib}
+    vclass = said.get("vClass", "passenger")
+    length, speed = _CLASS.get(vclass, (5.0, 200 / 3.6))
+    if said.get("carFollowModel") == "Rail":
+        length, speed = _RAIL_MODEL.get(said.get("trainType", "NGT400"), (length, speed))
+    # A distribution, norm(mean, deviation) or normc(mean, ...): its mean.
+    factor = re.search(r"[-+.\d][-+.\deE]*", said.get("speedFactor", "1"))
+    return Kind(
+        id=said.get("id", ""),
+        vclass=vclass,
+        length_m=float(said.get("length", length)),
+        max_speed_mps=float(said.get("maxSpeed", speed)),
+        speed_factor=float(factor[0]) if factor else 1.0,
+        attributes=said,
+    )
+
+
+def _members(mix: Element) -> list[str]:
+    return [e.get("id", e.get("refId", "")) for e in mix if e.tag == "vType"] + mix.get("vTypes", "").split()
+
+
+def _rail(demand: _Demand, kinds: dict[str, Kind]) -> tuple[list[Element], list[str]]:
+    """The trains among the vehicles, and what is left out."""
+    trains, others = [], 0
+    for train in demand.trains:
+        name = train.get("type", "DEFAULT_VEHTYPE")
+        types = _members(demand.mixes[name]) if name in demand.mixes else [name]
+        # A type that does not exist is a mistake, told later.
+        rail = [t for t in types if t not in kinds or kinds[t].vclass in RAIL]
+        trains += [train] * bool(rail)
+        others += not rail
+    counts = {word: sum(n for tag, n in demand.seen.items() if _PEOPLE.get(tag) == word) for word in ("persons", "containers")}
+    notes = [f"{n} definitions of {word} left out" for word, n in counts.items() if n]
+    notes += [f"{others} vehicles, trips and flows left out: not rail"] if others else []
+    notes += [f"{demand.seen['rerouter']} rerouters not followed"] if demand.seen.get("rerouter") else []
+    places = {t.get("departPos", "") for t in trains} & {"random", "free", "random_free", "last", "splitFront"}
+    notes += [
+        f'departPos="{p}": the train begins with its rear at the beginning of the edge, as with "base"' for p in sorted(places)
+    ]
+    speeds = {t.get("departSpeed", "") for t in trains} & {"random", "last", "avg"}
+    notes += [f'departSpeed="{s}": as fast as allowed' for s in sorted(speeds)]
+    if n := sum(t.get("speedFactor") is not None for t in trains):
+        notes.append(f"{n} trains with a speedFactor of their own: that of the vType holds")
+    routed = {t.get("route", "") for t in trains}
+    stops = [s for t in trains for s in t.iter("stop")] + [
+        s for r in routed & set(demand.routes) for s in demand.routes[r].iter("stop")
+    ]
+    for key in sorted({key for s in stops for key, value in s.items() if value not in ("0", "false")} - _STOP - _SILENT):
+        notes.append(f"{key} of stops is not followed")
+    drawn = {t.get("type", "") for t in trains}
+    drawn |= {member for name in drawn & set(demand.mixes) for member in _members(demand.mixes[name])}
+    for name in sorted(drawn & set(kinds)):
+        if "(" in (text := kinds[name].attributes.get("speedFactor", "")):
+            notes.append(f"vType {name}: speedFactor = {text}: its mean {kinds[name].speed_factor:g} for every train")
+    return trains, notes
+
+
+def _routes(train: Element, demand: _Demand) -> list[Element]:
+    """The routes a train is given, none for a trip."""
+    own = [r for r in train.iter("route") if r.get("edges")]
+    name = train.get("route", "")
+    mix = demand.drawn.get(name) if name else train.find("routeDistribution")
+    if mix is not None:
+        own = [r for r in mix if r.get("edges")]
+        own += [
+            demand.routes[n] for n in (*mix.get("routes", "").split(), *(r.get("refId", "") for r in mix)) if n in demand.routes
+        ]
+    return own or ([demand.routes[name]] if name in demand.routes else [])
+
+
+def _refuse(sumocfg: Path, trains: list[Element], demand: _Demand, kinds: dict[str, Kind], tracks: _Tracks) -> None:
+    if not trains:
+        raise InputError(f"{sumocfg}: no trains: no vehicle, trip or flow has a vType of a rail class ({', '.join(sorted(RAIL))})")
+    wrong = []
+    for train in trains:
+        who = f"{'flow' if train.tag == 'flow' else 'train'} {train.get('id', '')}"
+        name = train.get("type", "DEFAULT_VEHTYPE")
+        types = _members(demand.mixes[name]) if name in demand.mixes else [name]
+        wrong += [f"{who}: type = {t}: no such vType" for t in types if t not in kinds]
+        depart = train.get("depart", "")
+        if not re.match(r"[\d.]|begin$|$", depart):
+            wrong.append(f"{who}: depart = {depart}: must be a time")
+        routes = _routes(train, demand)
+        if train.get("route") and not routes:
+            wrong.append(f"{who}: route = {train.get('route')}: no such route")
+        ends = [*train.get("from", "").split(), *train.get("via", "").split(), *train.get("to", "").split()]
+        wrong += [f"{who}: edge {e}: not in the net" for e in ends if e not in tracks.onward]
+        wrong += [f"{who}: {m}" for s in train.iter("stop") if (m := _place(s, demand, tracks).wrong)]
+        for route in routes:
+            wrong += [f"{who}: {m}" for m in _unconnected(route.get("edges", "").split(), tracks)]
+            stops = [*route.iter("stop"), *(s for s in train if s.tag == "stop")]
+            places = [_place(s, demand, tracks) for s in stops]
+            wrong += [f"{who}: {p.wrong}" for p in places if p.wrong]
+            off = [e for p in places if not p.wrong and (e := p.lane.rpartition("_")[0]) not in route.get("edges", "").split()]
+            wrong += [f"{who}: stop on edge {e}: not on its route" for e in off]
+    if wrong:
+        raise InputError(list(dict.fromkeys(wrong)))
+
+
+def _unconnected(edges: list[str], tracks: _Tracks) -> list[str]:
+    unknown = [f"edge {e}: not in the net" for e in edges if e not in tracks.onward]
+    return unknown or [
+        f"its route is not connected: no way from edge {a} to edge {b}" for a, b in pairwise(edges) if b not in tracks.onward[a]
+    ]
+
+
+def _place(stop: Element, demand: _Demand, tracks: _Tracks) -> _Place:
+    """Where a stop is; ``wrong`` says why it is nowhere."""
+    for tag in _PLACES:
+        if (name := stop.get(tag)) is not None:
+            # SUMO takes a train stop for a bus stop, and duarouter writes it so.
+            if name not in demand.places:
+                return _Place("", 0.0, f"stop at {tag} {name}: no such {tag}")
+            where = demand.places[name]
+            break
+    else:
+        where, name = stop, ""
+    lane = where.get("lane") or (f"{where.get('edge')}_0" if where.get("edge") else "")
+    said = f"stop at {name}" if name else f"stop on edge {lane.rpartition('_')[0]}"
+    if lane not in tracks.length:
+        return _Place(lane, 0.0, f"{said}: lane {lane}: not in the net")
+    length = tracks.length[lane]
+    position = float(where.get("endPos", length))
+    position += length if position < 0 else 0.0
+    if where.get("friendlyPos", "0").lower() in ("1", "true", "yes", "on", "x", "t"):
+        position = min(max(position, 0.0), length)
+    # SUMO itself lets a stop be a bit beyond the end.
+    if not 0.0 <= position <= length + 0.1:
+        return _Place(lane, 0.0, f"{said}: endPos = {where.get('endPos')}: off the edge, which is {length:g} m long")
+    wrong = ""
+    if not name and stop.get("duration") is None and stop.get("until") is None:
+        wrong = f"{said}: neither duration nor until"
+    return _Place(lane, min(position, length), wrong)
+
+
+def _bare(element: Element, keys: set[str]) -> Element:
+    return Element(element.tag, {key: value for key, value in element.items() if key in keys})
+
+
+def _expand(
+    trains: list[Element], demand: _Demand, net: Path, work: Path, begin: float, end: float | None, seed: int
+) -> list[Element]:
+    """The vehicles duarouter makes of the trains."""
+    work.mkdir(parents=True, exist_ok=True)
+    more, routes = Element("additional"), Element("routes")
+    more.extend(demand.places.values())
+    named = {id(t) for mix in demand.mixes.values() for t in mix}
+    more.extend(t for name, t in demand.types.items() if id(t) not in named and name != "DEFAULT_VEHTYPE")
+    more.extend(demand.mixes.values())
+    drawn = {id(r) for mix in demand.drawn.values() for r in mix}
+    routes.extend(_route(r) for r in demand.routes.values() if id(r) not in drawn)
+    for mix in demand.drawn.values():
+        routes.append(_mix(mix))
+    for train in trains:
+        bare = _bare(train, _ROUTED)
+        for child in train:
+            if child.tag == "stop":
+                bare.append(_bare(child, _STOP))
+            elif child.tag == "route":
+                bare.append(_route(child))
+            elif child.tag == "routeDistribution":
+                bare.append(_mix(child))
+        routes.append(bare)
+    for name, element in (("stops.add.xml", more), ("demand.rou.xml", routes)):
+        ElementTree.ElementTree(element).write(work / name, encoding="utf-8")
+    options = {
+        "net-file": str(net.resolve()), "additional-files": "stops.add.xml", "route-files": "demand.rou.xml",
+        "output-file": "trains.rou.xml",
+        "begin": f"{begin:.3f}", "seed": str(seed), "precision": "9", "xml-validation": "never", "no-step-log": "true",
+        "unsorted-input": "true", "ignore-errors": "true",
+    }  # fmt: skip
+    if end is not None:
+        options["end"] = f"{end:.3f}"
+    made = work / "trains.rou.xml"
+    made.unlink(missing_ok=True)
+    try:
+        duarouter, environment = program("duarouter")
+        command = [str(duarouter), *(word for key, value in options.items() for word in (f"--{key}", value))]
+        done = subprocess.run(command, cwd=work, env=environment, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
+    except LineError as error:
+        raise InputError(error.mistakes) from None
+    except subprocess.TimeoutExpired:
+        raise InputError(f"duarouter: no end after {PATIENCE_S:g} s; does a flow have no end?") from None
+    wrong = _told(done.stderr)
+    if wrong:
+        raise InputError(wrong)
+    if done.returncode != 0 or not made.exists():
+        if "No route input" in done.stderr:
+            return []
+        raise InputError(
+            [f"duarouter: {line}" for line in done.stderr.splitlines() if line.startswith("Error")] or ["duarouter failed"]
+        )
+    return [e for e in _parse(made) if e.tag == "vehicle"]
+
+
+def _route(route: Element) -> Element:
+    bare = _bare(route, _ROUTE)
+    bare.extend(_bare(s, _STOP) for s in route.iter("stop"))
+    return bare
+
+
+def _mix(mix: Element) -> Element:
+    bare = _bare(mix, {"id", "routes", "probabilities", "last"})
+    bare.extend(_route(r) for r in mix.iter("route"))
+    return bare
+
+
+def _told(words: str) -> list[str]:
+    """Mistakes in what duarouter says: the line before the one that names the train says which edges."""
+    wrong, gap = [], ""
+    for line in words.splitlines():
+        _, _, said = line.partition(": ")
+        if found := re.search(r"No connection between edge '(.*)' and edge '(.*)' found", said):
+            gap = f"no way from edge {found[1]} to edge {found[2]}"
+        elif found := re.search(r"Mandatory edge '(.*)' not reachable by vehicle '(.*)'", said):
+            wrong.append(f"train {found[2]}: {gap or f'edge {found[1]} cannot be reached'}")
+            gap = ""
+        elif line.startswith("Error") and "No route input" not in said:
+            wrong.append(f"duarouter: {said}")
+    return wrong
+
+
+def _departure(vehicle: Element, source: Element, kind: Kind, demand: _Demand, tracks: _Tracks) -> tuple[Departure, list[str]]:
+    name, route = vehicle.get("id", ""), vehicle.find("route")
+    edges = () if route is None else tuple(route.get("edges", "").split())
+    stops = []
+    wrong = [f"train {name}: {m}" for m in _unconnected(list(edges), tracks)]
+    at = 0
+    for stop in vehicle.iter("stop"):
+        place = _place(stop, demand, tracks)
+        edge = place.lane.rpartition("_")[0]
+        label = next((stop.get(tag, "") for tag in _PLACES if stop.get(tag)), "")
+        stops.append(Stop(edge, place.position_m, float(stop.get("duration", "0")),
+                          _seconds(stop.get("until", "")) if stop.get("until") else None, label))  # fmt: skip
+        behind = stops[-2].position_m if len(stops) > 1 and stops[-2].edge == edge else -1.0
+        start = at if place.position_m >= behind else at + 1
+        if edge in edges[start:]:
+            at = edges.index(edge, start)
+        else:
+            wrong.append(f"train {name}: stop on edge {edge}: not on its route, or behind the stop before")
+    departure = Departure(
+        id=name,
+        kind=kind.id,
+        depart_s=_seconds(vehicle.get("depart", "0")),
+        edges=edges,
+        position_m=0.0,
+        speed_mps=None,
+        stops=tuple(stops),
+        arrival_m=None,
+        line=source.get("line", ""),
+    )
+    if wrong:
+        return departure, wrong
+    first, last = (tracks.length[f"{e}_0"] for e in (edges[0], edges[-1]))
+    try:
+        position = _depart_position(source.get("departPos", "base"), kind.length_m, first, departure)
+        arrival = source.get("arrivalPos", "max")
+        arrival_m = None if arrival in ("max", "random") else float(arrival) + (last if float(arrival) < 0 else 0.0)
+        # Without a word of it SUMO lets rail vehicles, and no others, begin as fast as they may.
+        speed = source.get("departSpeed", "max")
+        speed_mps = None if speed in ("max", "desired", "speedLimit", "last", "avg", "random") else float(speed)
+    except ValueError as error:
+        return departure, [f"train {name}: departPos, departSpeed, arrivalPos: {error}"]
+    if not 0.0 <= position <= first:
+        wrong.append(f"train {name}: departPos = {source.get('departPos')}: off edge {edges[0]}, which is {first:g} m long")
+    if stops and stops[0].edge == edges[0] and position >= stops[0].position_m:
+        speed_mps = 0.0
+    return departure._replace(position_m=position, arrival_m=arrival_m, speed_mps=speed_mps), wrong
+
+
+def _depart_position(said: str, length: float, first: float, departure: Departure) -> float:
+    """Front of the train on its first edge [m]."""
+    stop = departure.stops[0] if departure.stops and departure.stops[0].edge == departure.edges[0] else None
+    if said == "stop" and stop is not None:
+        return stop.position_m
+    if said in ("base", "stop", "random", "free", "random_free", "last", "splitFront"):
+        # SUMO puts the rear a bit behind the beginning of the edge, but no farther than the first stop.
+        base = min(length + 0.1, first)
+        return base if stop is None else min(base, stop.position_m)
+    position = float(said)
+    return position + first if position < 0 else position
