@@ -26,8 +26,7 @@ from sumo_net.spec import TRACK_SPACING_M, LineError
 Bools = NDArray[np.bool_]
 Pairs = set[tuple[int, int]]
 
-_SHORTEST_LANE_M = 0.1  # SUMO makes every lane at least this long
-_TOUCH_M = 1.0  # below it tracks meet; two tracks side by side are more than 2.5 m apart
+_TOUCH_M = 1.0  # below it tracks meet; side by side they come as near as 1.6 m on the sharp curves of a junction
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +35,7 @@ class Rails:
 
     edges: tuple[str, ...]  # SUMO ids; internal ones begin with ":"
     internal: Bools  # (E,)
-    length_m: Floats  # (E,) as SUMO uses it
+    length_m: Floats  # (E,) what the net says, as SUMO does, not the length of the shape
     speed_mps: Floats  # (E,) limit
     start_m: Floats  # (E,) kilometrage of the beginning, see potential()
     slope: Floats  # (E,) mean rise over run, in the direction of the edge
@@ -275,7 +274,7 @@ def _measure(lane: dict[str, str]) -> tuple[float, float, Floats]:
     length, speed = float(lane["length"]), float(lane["speed"])
     if not (0 < length < np.inf and 0 < speed < np.inf):
         raise ValueError(f"length = {length:g}, speed = {speed:g}: must be positive")
-    return max(length, _SHORTEST_LANE_M), speed, _shape(lane)
+    return length, speed, _shape(lane)
 
 
 def _rails(net: NetFile, file: str) -> Rails:
@@ -341,9 +340,9 @@ def _crossing(
 ) -> tuple[tuple[int, ...], ...]:
     """Which internal edges exclude each other without a common beginning or end.
 
-    Two ways over a junction do if the net calls them foes, if they end on the same track from its two directions, or if their
-    centre lines come within ``_TOUCH_M``. Foes alone do not do: netconvert gives them for tracks that cross, but only for half
-    of those that meet head on at a switch, for none that only touch, and for none at all on an unregulated junction.
+    Two ways over a junction do if the net calls them foes or if their centre lines come within ``_TOUCH_M``. Either alone is not
+    enough. netconvert calls tracks foes that cross, but only half of those that meet head on at a switch, none that only touch,
+    and none at all on an unregulated junction; and some of its foes cross outside the internal edges.
 
     A track and its twin do not cross each other, nor do ways that branch or merge.
     """
@@ -355,11 +354,11 @@ def _crossing(
         except (KeyError, ValueError):
             raise LineError([f"{file}: junction {junction.attributes.get('id', '')}: its requests are broken"]) from None
         for (i, one), (j, other) in combinations(lanes, 2):
-            head, tail = twin[one[0]] == other[-1], twin[one[-1]] == other[0]
-            if one[0] == other[0] or one[-1] == other[-1] or (head and tail):
+            same = twin[one[0]] == other[-1] and twin[one[-1]] == other[0]
+            if same or one[0] == other[0] or one[-1] == other[-1]:
                 continue
             foe = foes.get(i, "")[j : j + 1] == "1" or foes.get(j, "")[i : i + 1] == "1"
-            if head or tail or foe or _apart(*(np.vstack([shapes[k] for k in way[1:-1]]) for way in (one, other))) < _TOUCH_M:
+            if foe or _apart(*(np.vstack([shapes[k] for k in way[1:-1]]) for way in (one, other))) < _TOUCH_M:
                 pairs.update((a, b) for a in one[1:-1] for b in other[1:-1])
     return _neighbours(len(twin), pairs | {(b, a) for a, b in pairs})
 

@@ -1,4 +1,4 @@
-"""Any SUMO rail net as a graph, against nets made by netconvert and trains driven by SUMO."""
+"""Any SUMO rail net as a graph: nets made by netconvert, trains driven by SUMO."""
 
 from __future__ import annotations
 
@@ -64,13 +64,12 @@ def convert(tmp_path: Path) -> Callable[..., Path]:
     return make
 
 
-def grid(folder: Path, number: int) -> Path:
+def generate(folder: Path, kind: str) -> Path:
     """A net of netgenerate on which trains turn in every direction."""
     program, environment = netconvert()
-    options = f"--grid --grid.number {number} --grid.length 300 --default.allow rail --no-turnarounds -o grid.net.xml"
-    command = [str(program.with_name("netgenerate")), *options.split()]
+    command = [str(program.with_name("netgenerate")), *f"{kind} --default.allow rail --no-turnarounds -o any.net.xml".split()]
     subprocess.run(command, cwd=folder, env=environment, check=True, capture_output=True)
-    return folder / "grid.net.xml"
+    return folder / "any.net.xml"
 
 
 def wheel_net() -> Path:
@@ -112,7 +111,7 @@ def whole(rails: Rails) -> None:
         for f in ("internal", "length_m", "speed_mps", "start_m", "slope", "after", "before", "twin", "crossing")
     } == {n}
     assert {(a, b) for a, row in enumerate(rails.after) for b in row} == {(a, b) for b, row in enumerate(rails.before) for a in row}
-    assert np.isfinite(rails.start_m).all() and (rails.length_m >= 0.1).all()
+    assert np.isfinite(rails.start_m).all() and (rails.length_m > 0).all()
     for k, edge in enumerate(rails.edges):
         assert rails.internal[k] == edge.startswith(":")
         assert list(rails.after[k]) == sorted(set(rails.after[k])) and list(rails.before[k]) == sorted(set(rails.before[k]))
@@ -193,16 +192,33 @@ def test_a_diamond_crossing_is_one_whatever_the_junction(convert, kind):
     assert rails.start_m.tolist().count(0.0) == 2  # two tracks that are not connected: each has its own kilometrage
 
 
-def test_tracks_side_by_side_over_one_junction_do_not_cross(convert):
-    nodes = {"c": (0, 0), "w": (-500, 0), "e": (500, 0), "v": (-500, -5), "d": (500, -5)}
-    shape = 'shape="{},{} {},{}" spreadType="center"'
-    edges = {
-        "wc": "w c " + shape.format(-500, 0, 0, 0), "ce": "c e " + shape.format(0, 0, 500, 0),
-        "dc": "d c " + shape.format(500, -5, 0, -5), "cv": "c v " + shape.format(0, -5, -500, -5),
-    }  # fmt: skip
-    rails = Rails.read(convert(nodes, edges, "wc>ce dc>cv"))
-    assert rails.internal.sum() == 2
-    assert not crossings(rails)
+@pytest.mark.parametrize(
+    ("foes", "pairs"),
+    [
+        (("000", "000", "000"), []),
+        (("000", "100", "010"), [(1, 2)]),
+        (("100", "000", "000"), [(0, 2)]),  # one of the two says so
+        (("110", "101", "011"), [(0, 1), (0, 2), (1, 2)]),
+    ],
+)
+def test_tracks_side_by_side_cross_only_where_the_net_calls_them_foes(convert, foes, pairs):
+    nodes: Nodes = {"x": (0, 0)}
+    edges: Edges = {}
+    for y, track in zip((5, 0, -5), "abc", strict=True):
+        nodes |= {f"{track}1": (-500, y), f"{track}2": (500, y)}
+        edges[f"{track}s"] = f'{track}1 x shape="-500,{y} 0,{y}" spreadType="center"'
+        edges[f"{track}e"] = f'x {track}2 shape="0,{y} 500,{y}" spreadType="center"'
+    net = convert(nodes, edges, "as>ae bs>be cs>ce")
+    words = net.read_text()
+    assert words.count('foes="000"') == 3
+    lanes = re.search(r'id="x" [^>]*intLanes="([^"]*)"', words)
+    assert lanes is not None
+    links = [re.search(rf'to="(.e)"[^>]*via="{lane}"', words)[1] for lane in lanes[1].split()]  # type: ignore[index]
+    for row in foes:
+        words = words.replace('foes="000"', f'foes=" {row}"', 1)
+    net.write_text(words.replace('foes=" ', 'foes="'))
+    found = {frozenset(to for _, to in pair) for pair in crossings(Rails.read(net))}
+    assert found == {frozenset((links[i], links[j])) for i, j in pairs}
 
 
 def test_tracks_that_only_touch_cross_although_the_net_calls_them_no_foes(convert):
@@ -296,29 +312,40 @@ def test_a_place_to_wait_on_a_junction_makes_a_chain(convert):
 
 
 def test_roads_are_left_out_and_the_lane_for_trains_counts(convert, tmp_path):
-    lanes = '<lane index="0" allow="bicycle" speed="5"/><lane index="1" allow="tram bus" speed="15"/>'
-    net = convert({"a": (0, 0), "b": (400, 0), "c": (800, 0), "d": (400, 300)}, {"ab": "a b", "bc": "b c", "bd": "b d"}, "", lane='numLanes="2" allow="passenger"')  # fmt: skip
-    assert '"bd"' in net.read_text()
+    nodes = {"a": (0, 0), "b": (400, 0), "c": (800, 0), "d": (400, 300)}
+    edges = {"ab": "a b", "bc": "b c", "bd": "b d"}
+    net = convert(nodes, edges, "", lane='numLanes="2" allow="passenger bicycle"')
     with pytest.raises(LineError, match="has no rail edges"):
         Rails.read(net)
+    lanes = '<lane index="0" allow="bicycle" speed="5"/><lane index="1" allow="tram bus" speed="15"/>'
     words = (tmp_path / "e.xml").read_text()
     for edge in ("ab", "bc"):
-        words = re.sub(rf'(<edge id="{edge}"[^>]*) allow="passenger" */>', rf"\1>{lanes}</edge>", words)
+        words = re.sub(rf'(<edge id="{edge}"[^>]*) allow="passenger bicycle" */>', rf"\1>{lanes}</edge>", words)
     (tmp_path / "e.xml").write_text(words)
     program, environment = netconvert()
-    subprocess.run(
-        [str(program), "-n", "n.xml", "-e", "e.xml", "-o", "x.net.xml"],
-        cwd=tmp_path,
-        env=environment,
-        check=True,
-        capture_output=True,
-    )
+    command = [str(program), "-n", "n.xml", "-e", "e.xml", "-o", "x.net.xml"]
+    subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True)
+    assert 'from="ab" to="bd"' in net.read_text()  # for bicycles
     rails = Rails.read(net)
     whole(rails)
     assert leads(rails) == {"ab": {"bc"}, "bc": set()}
     assert rails.speed_mps[:2].tolist() == [15.0, 15.0]
     with pytest.raises(ValueError, match="edge bd: not on this net, or not for trains"):
         rails.way(["ab", "bd"])
+
+
+def test_a_connection_whose_lane_on_the_junction_is_not_for_trains_is_none(convert):
+    net = convert(FORK, FORK_EDGES)
+    words = net.read_text()
+    for start, to in (("ms", "sr"), ("bm", "ms")):
+        via = re.search(rf'from="{start}" to="{to}"[^>]*via="([^"]*)"', words)
+        assert via is not None
+        words = re.sub(rf'(<lane id="{via[1]}"[^>]*)allow="rail"', r'\1allow="bus"', words)
+    net.write_text(words)
+    rails = Rails.read(net)
+    whole(rails)
+    assert leads(rails) == {"am": {"ms"}, "bm": set(), "ms": {"sl"}, "sl": set(), "sr": set()}
+    assert rails.internal.sum() == 2
 
 
 def test_the_slope_is_rise_over_run_and_turns_with_the_direction(convert):
@@ -381,7 +408,7 @@ def test_the_railway_that_comes_with_sumo():
 
 
 def test_a_way_expands_routes_and_sumo_runs_over_it(tmp_path):
-    net = grid(tmp_path, 5)
+    net = generate(tmp_path, "--grid --grid.number 5 --grid.length 300")
     rails = Rails.read(net)
     whole(rails)
     rng = np.random.default_rng(1)
@@ -402,7 +429,7 @@ def test_the_shortest_path_is_that_of_all_pairs(tmp_path):
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import dijkstra
 
-    rails = Rails.read(grid(tmp_path, 4))
+    rails = Rails.read(generate(tmp_path, "--rand --rand.iterations 60 --seed 3"))
     links = np.array([(a, b) for a, row in enumerate(rails.after) for b in row])
     cost = dijkstra(csr_array((rails.length_m[links[:, 1]], links.T), shape=(len(rails.edges),) * 2))
     for a, b in np.random.default_rng(2).integers(0, len(rails.edges), (200, 2)).tolist():
@@ -499,7 +526,7 @@ def test_ten_thousand_edges_are_read_at_once(tmp_path):
     spec = parse_spec(
         {"name": "long", "tracks": ["a", "b", "c"], "length_m": 3.4e6, "max_edge_m": 1000.0, "speed": [[0.0, 80.0]]}, ""
     )
-    nets = {"ours": build(spec, tmp_path), "grid": grid(tmp_path, 16)}
+    nets = {"ours": build(spec, tmp_path), "grid": generate(tmp_path, "--grid --grid.number 16 --grid.length 300")}
     for name, net in nets.items():
         began = time.process_time()
         rails = Rails.read(net)
