@@ -97,7 +97,8 @@ def start(
             slack = rng.choice([0.0, 0.0, rng.exponential(300.0)])
             x[i] = x[i - 1] - length[i - 1] - params.margin_m - max(0.0, way[i] - ahead) - slack
     top = np.maximum.reduceat(x + 1.6 * way, np.arange(0, n, PER_COLUMN))
-    begin = np.column_stack([np.full(columns, -np.inf), top[:, None] + np.cumsum(rng.exponential(900.0, (columns, 7)), 1) + 700.0])
+    ahead = top[:, None] + 700.0 + np.cumsum(rng.exponential(900.0, (columns, 7)), 1)
+    begin = np.column_stack([np.full(columns, -np.inf), ahead])
     limit = np.column_stack([np.full(columns, 85.0), rng.uniform(3.0, 85.0, (columns, 7))])
     # Far enough to brake for the first limit with 0.7 m/s2 from the fastest start in whole steps.
     begin[:, 1:] += 80.0**2 / (2 * params.service_mps2) + 85.0 * step * 2

@@ -7,6 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from trainctl import supervisor
+from trainctl.plants import point
 from trainctl.supervisor import END, KINDS, LIMIT, OPPOSING, STOP, SWITCH, TRAIN, Limits, Params, Targets
 
 PARAMS = Params(mode="on")  # 1.0, 0.7, 20 m
@@ -88,7 +89,8 @@ def test_the_nearest_bind_names_kind_and_row():
 
 def test_opposing_trains_share_what_is_left_of_the_way():
     both = supervisor.stopping_distance(np.array([20.0, 30.0]), 1.0, 1.0, 0.5).sum()
-    for left, expected in ((0.0, [-1.0, -1.0]), (10.0, [-1.0 + 5.0 / 20.0, -1.0 + 5.0 / 30.0])):  # 5 m each: 20 or 30 s of braking
+    each = [-1.0 + 5.0 / 20.0, -1.0 + 5.0 / 30.0]  # 5 m each, in 20 and 30 s of braking
+    for left, expected in ((0.0, [-1.0, -1.0]), (10.0, each)):
         pair = [target(both + 20.0 + left, v, True, OPPOSING, i) for i, v in ((0, 30.0), (1, 20.0))]
         np.testing.assert_allclose(judged([20.0, 30.0], *pair).greatest, expected)
 
@@ -111,6 +113,19 @@ def test_applied_keeps_the_verdict_and_says_where_it_changed_the_motion():
     acceleration, intervened = supervisor.applied(verdict, np.array([0.5, 3.0, -0.9, -1.5, np.nan]))
     assert acceleration.tolist() == [0.5, 1.0, -0.4, -1.0, -1.0]
     assert intervened.tolist() == [False, True, False, True, True]
+
+
+def test_point_trains_move_as_the_verdict_takes_them_to():
+    """Driven at the verdict by their own plant, they come to stand at the margin and not beyond it."""
+    davis = np.tile([0.01, 1e-4, 1e-5], (3, 1))
+    constants = point.Constants(davis, *(np.full(3, c) for c in (1.0, -np.inf, np.inf, 0.0, np.inf)), np.zeros((0, 2)))
+    own = np.array([[0.0, 40.0], [0.0, 13.3], [0.0, 0.0]])
+    for _ in range(700):
+        ahead = [target(2000.0 - x, kind=END, train=i) for i, x in enumerate(own[:, 0])]
+        a, _ = supervisor.applied(judged(own[:, 1], *ahead, step=0.5, theta=0.0), np.full(3, 9.0))
+        own = point.advance(constants, own, a, 0.5, point.Kick.none(3)).own
+        assert own[:, 0].max() < 1980.0 + 1e-6
+    assert own[:, 0].min() > 1979.9
 
 
 def test_service_beyond_emergency_is_refused():
