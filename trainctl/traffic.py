@@ -7,8 +7,11 @@ alone: it leaves out trains with a ``line`` without a word, so everything else i
 from __future__ import annotations
 
 import gzip
+import math
 import re
 import subprocess
+import zlib
+from collections import Counter
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -16,8 +19,10 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
+from pydantic import ValidationError
+
 from sumo_net.build import program
-from sumo_net.netfile import RAIL
+from sumo_net.netfile import RAIL, read_net
 from sumo_net.spec import LineError
 from trainctl.errors import InputError
 from trainctl.scenario import TrainType
@@ -32,12 +37,31 @@ _CLASS = {
     "tram": (22.0, 80 / 3.6), "subway": (109.5, 100 / 3.6), "cable_car": (5.0, 200 / 3.6),
 }  # fmt: skip
 
-#: The same of the train types of SUMO's Rail model.
+
+class _Built(NamedTuple):
+    """What SUMO's Rail model knows of a train type, tables aside."""
+
+    length_m: float
+    speed_mps: float
+    mass_kg: float
+    mass_factor: float
+    deceleration_mps2: float
+
+
+#: Train types of SUMO's Rail model; the mass of "custom" stands for no train.
 _RAIL_MODEL = {
-    "NGT400": (200.0, 500 / 3.6), "NGT400_16": (200.0, 430 / 3.6), "ICE1": (358.0, 250 / 3.6), "ICE3": (200.0, 300 / 3.6),
-    "REDosto7": (207.0, 160 / 3.6), "RB425": (67.5, 160 / 3.6), "RB628": (46.0, 120 / 3.6), "Freight": (512.0, 120 / 3.6),
-    "MireoPlusB": (46.56, 160 / 3.6), "MireoPlusH": (46.56, 160 / 3.6), "custom": (100.0, 200 / 3.6),
-}  # fmt: skip
+    "NGT400": _Built(200.0, 500 / 3.6, 384e3, 1.04, 0.9),
+    "NGT400_16": _Built(200.0, 430 / 3.6, 384e3, 1.04, 0.9),
+    "ICE1": _Built(358.0, 250 / 3.6, 876e3, 1.1, 0.5),
+    "ICE3": _Built(200.0, 300 / 3.6, 420e3, 1.04, 0.5),
+    "REDosto7": _Built(207.0, 160 / 3.6, 425.5e3, 1.1, 0.5),
+    "RB425": _Built(67.5, 160 / 3.6, 138e3, 1.04, 1.0),
+    "RB628": _Built(46.0, 120 / 3.6, 72.2e3, 1.04, 0.5),
+    "Freight": _Built(512.0, 120 / 3.6, 1440e3, 1.06, 0.3),
+    "MireoPlusB": _Built(46.56, 160 / 3.6, 105.5e3, 1.05, 1.1),
+    "MireoPlusH": _Built(46.56, 160 / 3.6, 105.4e3, 1.05, 1.1),
+    "custom": _Built(100.0, 200 / 3.6, 100e3, 1.05, 1.0),
+}
 
 #: What SUMO calls one thing: the places a train can stop at.
 _PLACES = ("trainStop", "busStop", "containerStop", "parkingArea", "chargingStation", "overheadWireSegment")
@@ -56,6 +80,10 @@ _ROUTE = {"id", "edges", "probability", "repeat", "cycleTime", "refId"}
 _STOP = {"lane", "edge", "startPos", "endPos", "friendlyPos", "duration", "until", *_PLACES}
 #: What a stop may say that changes nothing here.
 _SILENT = {"line", "tripId", "actType", "color", "name", "arrival", "started", "ended", "posLat", "index", "lane", "parking"}
+
+
+#: What a vType must say to be a plant of ours, in SUMO's units: kg, kW, kN, and kN with m/s.
+_CONSTANTS = ("mass", "maxPower", "maxTraction", "resCoef_constant", "resCoef_linear", "resCoef_quadratic")
 
 
 class Stop(NamedTuple):
@@ -165,6 +193,14 @@ def read_traffic(sumocfg: Path, work: Path, end_s: float | None = None, seed: in
     ends = [e for e in (own_end, end_s) if e is not None]
     tracks = _tracks(net[0])
     demand = _demand([*more, *routes])
+    wrong = [
+        f"vType {name}: {key} = {element.get(key)}: must be a number, not negative"
+        for name, element in demand.types.items()
+        for key in ("length", "maxSpeed")
+        if _bad(element.get(key))
+    ]
+    if wrong:
+        raise InputError(wrong)
     kinds = {name: _kind(element) for name, element in demand.types.items()}
     trains, notes = _rail(demand, kinds)
     _refuse(sumocfg, trains, demand, kinds, tracks)
@@ -206,27 +242,29 @@ def train_type(kind: Kind) -> TrainType | list[str]:
     traction is the smaller of ``maxTraction`` and ``maxPower`` over the speed, ``decel`` is braking effort over inertia. The train
     types built into SUMO are tables of speed and force, which no key of ours can hold.
     """
-    value = {
-        key: kind.attributes[key]
-        for key in ("mass", "maxPower", "maxTraction", "resCoef_constant", "resCoef_linear", "resCoef_quadratic")
-        if key in kind.attributes
-    }
-    model, base = kind.attributes.get("carFollowModel", "Krauss"), kind.attributes.get("trainType", "NGT400")
-    if model != "Rail":
-        value = {"mass": value["mass"]} if "mass" in value else {}  # any other model takes no notice of them
-    lacking = [f"no {key}" for key in ("mass", "maxPower", "maxTraction", "resCoef_constant", "resCoef_linear", "resCoef_quadratic")
-               if key not in value]  # fmt: skip
-    cure = (
-        f'add [train_type.{kind.id}] to the scenario, or carFollowModel="Rail", trainType="custom" with mass (kg), maxPower (kW), '
-    )
-    cure += "maxTraction (kN), resCoef_constant, resCoef_linear, resCoef_quadratic (kN) to the vType"
-    if lacking:
-        built = f" (trainType {base} is a table inside SUMO)" if model == "Rail" and base != "custom" else ""
-        return [f"vType {kind.id}: {', '.join(lacking)}{built}: {cure}"]
+    said = kind.attributes
+    rail, base = said.get("carFollowModel") == "Rail", said.get("trainType", "NGT400")
+    built = _RAIL_MODEL.get(base, _RAIL_MODEL["custom"])
+    # Any other model takes notice of the mass alone.
+    value = {key: said[key] for key in _CONSTANTS if key in said and (rail or key == "mass")}
+    if rail and base != "custom" and base in _RAIL_MODEL:
+        value.setdefault("mass", str(built.mass_kg))
+    if lacking := [f"no {key}" for key in _CONSTANTS if key not in value]:
+        why = f" (SUMO has trainType {base} as tables)" if rail and base != "custom" and base in _RAIL_MODEL else ""
+        return [
+            f"vType {kind.id}: {', '.join(lacking)}{why}: add [train_type.{kind.id}] to the scenario, or"
+            f' carFollowModel="Rail" trainType="custom" with {", ".join(_CONSTANTS)} to the vType'
+        ]
+    checked = {key: said[key] for key in ("massFactor", "decel") if key in said} | value
+    if mistakes := [
+        f"vType {kind.id}: {key} = {text}: must be a number, not negative" for key, text in checked.items() if _bad(text)
+    ]:
+        return mistakes
+    mass, power, traction, c0, c1, c2 = (float(value[key]) for key in _CONSTANTS)
+    if mass <= 0:
+        return [f"vType {kind.id}: mass = {mass:g}: must be above 0"]
+    factor = float(said.get("massFactor", built.mass_factor))
     try:
-        mass, power, traction, c0, c1, c2 = (float(value[key]) for key in value)
-        factor = float(kind.attributes.get("massFactor", "1.08" if base == "custom" else "1.04"))
-        decel = float(kind.attributes.get("decel", "1.0"))
         return TrainType(
             unit_length_m=kind.length_m,
             unit_mass_kg=mass,
@@ -236,10 +274,18 @@ def train_type(kind: Kind) -> TrainType | list[str]:
             c2_ns2_per_m2_kg=1e3 * c2 / mass,
             traction_n=1e3 * traction,
             traction_power_w=1e3 * power,
-            braking_n=decel * mass * factor,
+            braking_n=float(said.get("decel", built.deceleration_mps2)) * mass * factor,
         )
-    except (ValueError, ZeroDivisionError) as error:
-        return [f"vType {kind.id}: its data make no train: {' '.join(str(error).split())}"]
+    except ValidationError as error:
+        return [f"vType {kind.id}: {e['msg'].removeprefix('Value error, ')}" for e in error.errors()]
+
+
+def _bad(text: str | None) -> bool:
+    """Whether a text is no number, or a negative one."""
+    try:
+        return text is not None and not 0.0 <= float(text) < math.inf
+    except ValueError:
+        return True
 
 
 def _seconds(text: str) -> float:
@@ -250,13 +296,25 @@ def _seconds(text: str) -> float:
     return value
 
 
+def _is_time(text: str) -> bool:
+    try:
+        return math.isfinite(_seconds(text))
+    except ValueError:
+        return False
+
+
 def _parse(path: Path) -> Element:
     try:
         content = path.read_bytes()
-        return ElementTree.fromstring(gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content)
+        content = gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content
+        if b"<!DOCTYPE" in content:
+            raise InputError(f"{path}: declares a document type, which a SUMO file does not")
+        return ElementTree.fromstring(content)
+    except gzip.BadGzipFile as error:
+        raise InputError(f"{path}: not XML: {error}") from None
     except OSError as error:
         raise InputError(f"{path}: {'no such file' if isinstance(error, FileNotFoundError) else error.strerror}") from None
-    except (ElementTree.ParseError, EOFError, ValueError) as error:
+    except (ElementTree.ParseError, EOFError, LookupError, ValueError, zlib.error) as error:
         raise InputError(f"{path}: not XML: {error}") from None
 
 
@@ -264,10 +322,8 @@ def _options(sumocfg: Path) -> dict[str, str]:
     root = _parse(sumocfg)
     if root.tag not in ("configuration", "sumoConfiguration"):
         raise InputError(f"{sumocfg}: not a SUMO configuration: it begins with <{root.tag}>, not <sumoConfiguration>")
-    found = {
-        _OPTIONS.get(e.tag, e.tag): e.get("value", e.get("v", "")) for e in root.iter() if e.get("value", e.get("v")) is not None
-    }
-    return found
+    said = {e.tag: value for e in root.iter() if (value := e.get("value", e.get("v"))) is not None}
+    return {_OPTIONS.get(key, key): value for key, value in said.items()}
 
 
 def _files(sumocfg: Path, options: dict[str, str], key: str) -> list[Path]:
@@ -275,21 +331,24 @@ def _files(sumocfg: Path, options: dict[str, str], key: str) -> list[Path]:
 
 
 def _tracks(net: Path) -> _Tracks:
-    root = _parse(net)
-    if root.tag != "net":
-        raise InputError(f"{net}: not a SUMO net: it begins with <{root.tag}>, not <net>")
-    length = {lane.get("id", ""): float(lane.get("length", "0")) for lane in root.iter("lane")}
-    onward: dict[str, set[str]] = {edge.get("id", ""): set() for edge in root.iter("edge")}
-    for c in root.iter("connection"):
-        onward.setdefault(c.get("from", ""), set()).add(c.get("to", ""))
+    try:
+        file = read_net(net)
+    except LineError as error:
+        raise InputError(error.mistakes) from None
+    length = {lane["id"]: float(lane["length"]) for edge in file.edges for lane in edge.lanes}
+    onward: dict[str, set[str]] = {edge.attributes.get("id", ""): set() for edge in file.edges}
+    for c in file.connections:
+        onward.setdefault(c["from"], set()).add(c["to"])
     return _Tracks(length, onward)
 
 
-def _elements(path: Path) -> Iterator[Element]:
+def _elements(path: Path, within: tuple[Path, ...] = ()) -> Iterator[Element]:
     """What a file says at its top, with the files it includes."""
+    if path.resolve() in within:
+        raise InputError(f"{path}: includes itself")
     for element in _parse(path):
         if element.tag == "include":
-            yield from _elements(path.parent / element.get("href", ""))
+            yield from _elements(path.parent / element.get("href", ""), (*within, path.resolve()))
         else:
             yield element
 
@@ -321,8 +380,8 @@ def _kind(element: Element) -> Kind:
             said |= {"carFollowModel": child.tag.partition("-")[2], **child.attrib}
     vclass = said.get("vClass", "passenger")
     length, speed = _CLASS.get(vclass, (5.0, 200 / 3.6))
-    if said.get("carFollowModel") == "Rail":
-        length, speed = _RAIL_MODEL.get(said.get("trainType", "NGT400"), (length, speed))
+    if said.get("carFollowModel") == "Rail" and (built := _RAIL_MODEL.get(said.get("trainType", "NGT400"))) is not None:
+        length, speed = built.length_m, built.speed_mps
     # A distribution, norm(mean, deviation) or normc(mean, ...): its mean.
     factor = re.search(r"[-+.\d][-+.\deE]*", said.get("speedFactor", "1"))
     return Kind(
@@ -359,8 +418,10 @@ def _rail(demand: _Demand, kinds: dict[str, Kind]) -> tuple[list[Element], list[
     ]
     speeds = {t.get("departSpeed", "") for t in trains} & {"random", "last", "avg"}
     notes += [f'departSpeed="{s}": as fast as allowed' for s in sorted(speeds)]
+    if n := sum(t.get("arrivalSpeed") is not None for t in trains):
+        notes.append(f"{n} trains, trips and flows with an arrivalSpeed: it is not followed")
     if n := sum(t.get("speedFactor") is not None for t in trains):
-        notes.append(f"{n} trains with a speedFactor of their own: that of the vType holds")
+        notes.append(f"{n} trains, trips and flows with a speedFactor of their own: that of the vType holds")
     routed = {t.get("route", "") for t in trains}
     stops = [s for t in trains for s in t.iter("stop")] + [
         s for r in routed & set(demand.routes) for s in demand.routes[r].iter("stop")
@@ -392,14 +453,17 @@ def _refuse(sumocfg: Path, trains: list[Element], demand: _Demand, kinds: dict[s
     if not trains:
         raise InputError(f"{sumocfg}: no trains: no vehicle, trip or flow has a vType of a rail class ({', '.join(sorted(RAIL))})")
     wrong = []
+    seen = Counter(train.get("id", "") for train in trains)
     for train in trains:
         who = f"{'flow' if train.tag == 'flow' else 'train'} {train.get('id', '')}"
         name = train.get("type", "DEFAULT_VEHTYPE")
         types = _members(demand.mixes[name]) if name in demand.mixes else [name]
         wrong += [f"{who}: type = {t}: no such vType" for t in types if t not in kinds]
-        depart = train.get("depart", "")
-        if not re.match(r"[\d.]|begin$|$", depart):
-            wrong.append(f"{who}: depart = {depart}: must be a time")
+        if seen[train.get("id", "")] > 1:
+            wrong.append(f"{who}: there are several of this id")
+        depart = train.get("depart", "0")
+        if depart != "begin" and not _is_time(depart):
+            wrong.append(f"{who}: depart = {depart}: must be a time; what a train is to wait for is not known before the run")
         routes = _routes(train, demand)
         if train.get("route") and not routes:
             wrong.append(f"{who}: route = {train.get('route')}: no such route")
@@ -411,8 +475,8 @@ def _refuse(sumocfg: Path, trains: list[Element], demand: _Demand, kinds: dict[s
             stops = [*route.iter("stop"), *(s for s in train if s.tag == "stop")]
             places = [_place(s, demand, tracks) for s in stops]
             wrong += [f"{who}: {p.wrong}" for p in places if p.wrong]
-            off = [e for p in places if not p.wrong and (e := p.lane.rpartition("_")[0]) not in route.get("edges", "").split()]
-            wrong += [f"{who}: stop on edge {e}: not on its route" for e in off]
+            if not route.get("repeat") and not any(p.wrong for p in places):
+                wrong += [f"{who}: {m}" for m in _off_route(tuple(route.get("edges", "").split()), places)]
     if wrong:
         raise InputError(list(dict.fromkeys(wrong)))
 
@@ -440,7 +504,14 @@ def _place(stop: Element, demand: _Demand, tracks: _Tracks) -> _Place:
     if lane not in tracks.length:
         return _Place(lane, 0.0, f"{said}: lane {lane}: not in the net")
     length = tracks.length[lane]
-    position = float(where.get("endPos", length))
+    said_wrong = [f"{key} = {stop.get(key)}" for key in ("duration", "until") if not _is_time(stop.get(key, "0"))]
+    try:
+        position = float(where.get("endPos", length))
+    except ValueError:
+        said_wrong.append(f"endPos = {where.get('endPos')}")
+        position = 0.0
+    if said_wrong:
+        return _Place(lane, 0.0, f"{said}: {', '.join(said_wrong)}: must be a number")
     position += length if position < 0 else 0.0
     if where.get("friendlyPos", "0").lower() in ("1", "true", "yes", "on", "x", "t"):
         position = min(max(position, 0.0), length)
@@ -451,6 +522,21 @@ def _place(stop: Element, demand: _Demand, tracks: _Tracks) -> _Place:
     if not name and stop.get("duration") is None and stop.get("until") is None:
         wrong = f"{said}: neither duration nor until"
     return _Place(lane, min(position, length), wrong)
+
+
+def _off_route(edges: tuple[str, ...], places: list[_Place]) -> list[str]:
+    """Stops that a train does not come to, one after the other."""
+    wrong, at, behind = [], 0, 0.0
+    for place in places:
+        edge = place.lane.rpartition("_")[0]
+        start = at + 1 if edges[at : at + 1] == (edge,) and place.position_m < behind else at
+        if edge in edges[start:]:
+            at, behind = edges.index(edge, start), place.position_m
+        elif edge in edges:
+            wrong.append(f"stop on edge {edge} at {place.position_m:g} m: lies behind the stop before")
+        else:
+            wrong.append(f"stop on edge {edge}: not on its route")
+    return wrong
 
 
 def _bare(element: Element, keys: set[str]) -> Element:
@@ -543,21 +629,18 @@ def _told(words: str) -> list[str]:
 def _departure(vehicle: Element, source: Element, kind: Kind, demand: _Demand, tracks: _Tracks) -> tuple[Departure, list[str]]:
     name, route = vehicle.get("id", ""), vehicle.find("route")
     edges = () if route is None else tuple(route.get("edges", "").split())
-    stops = []
-    wrong = [f"train {name}: {m}" for m in _unconnected(list(edges), tracks)]
-    at = 0
-    for stop in vehicle.iter("stop"):
-        place = _place(stop, demand, tracks)
-        edge = place.lane.rpartition("_")[0]
-        label = next((stop.get(tag, "") for tag in _PLACES if stop.get(tag)), "")
-        stops.append(Stop(edge, place.position_m, float(stop.get("duration", "0")),
-                          _seconds(stop.get("until", "")) if stop.get("until") else None, label))  # fmt: skip
-        behind = stops[-2].position_m if len(stops) > 1 and stops[-2].edge == edge else -1.0
-        start = at if place.position_m >= behind else at + 1
-        if edge in edges[start:]:
-            at = edges.index(edge, start)
-        else:
-            wrong.append(f"train {name}: stop on edge {edge}: not on its route, or behind the stop before")
+    places = [_place(stop, demand, tracks) for stop in vehicle.iter("stop")]
+    wrong = [f"train {name}: {m}" for m in (*_unconnected(list(edges), tracks), *_off_route(edges, places))]
+    stops = [
+        Stop(
+            edge=place.lane.rpartition("_")[0],
+            position_m=place.position_m,
+            duration_s=max(_seconds(stop.get("duration", "0")), 0.0),
+            until_s=_seconds(stop.get("until", "")) if stop.get("until") else None,
+            name=next((stop.get(tag, "") for tag in _PLACES if stop.get(tag)), ""),
+        )
+        for stop, place in zip(vehicle.iter("stop"), places, strict=True)
+    ]
     departure = Departure(
         id=name,
         kind=kind.id,
