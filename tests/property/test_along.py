@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trainctl.topology import along
+from trainctl.topology.ways import ways as laid
 
 HORIZONS = (40.0, 150.0, 1000.0)
 
@@ -42,7 +43,7 @@ def random_traffic(rng, railway, n):
         while len(path) < 12 and railway.after[path[-1]]:
             path.append(int(rng.choice(railway.after[path[-1]])))
         paths.append(path)
-    ways = along.ways(paths, railway.length_m)
+    ways = laid(paths, np.zeros(len(railway.length_m)), railway.length_m)
     row = np.array([rng.integers(a, b) for a, b in zip(ways.first[:-1], ways.first[1:], strict=True)])
     s = ways.begin[row] + np.floor(rng.random(n) * (2.0 * railway.length_m[ways.edge[row]] + 1.0)) / 2.0
     order = along.Order(*(np.zeros(0, np.int64) for _ in range(3)))

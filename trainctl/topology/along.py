@@ -11,7 +11,6 @@ A train that reverses begins a new way.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -19,19 +18,12 @@ from numba import njit
 
 from trainctl.kernels import keep_by_sources
 from trainctl.signals import Bools, Floats, Ints
+from trainctl.topology.ways import Ways
 
 keep_by_sources()  # before anything below is decorated
 
 #: Rank of a train whose turn at a join is not decided.
 UNDECIDED = np.iinfo(np.int64).max
-
-
-class Ways(NamedTuple):
-    """What every train will run over, and has run over since its departure; train i has the rows first[i]:first[i + 1]."""
-
-    first: Ints  # (n + 1,)
-    edge: Ints  # (W,) edge numbers in running order, internal edges included
-    begin: Floats  # (W,) m from the beginning of the way to the start of that edge
 
 
 class Railway(Protocol):
@@ -119,17 +111,6 @@ def net(railway: Railway) -> Net:
         cross_first=np.concatenate([[0], np.cumsum([len(c) for c in crossing], dtype=np.int64)]).astype(np.int64),
         cross=np.array([e for c in crossing for e in c], np.int64),
     )
-
-
-def ways(edges: Sequence[Sequence[int]], length: Floats) -> Ways:
-    """Ways over these edge numbers, one sequence per train; ``length`` (E,) [m]."""
-    counts = [len(e) for e in edges]
-    edge = np.array([e for way in edges for e in way], np.int64)
-    first = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)]).astype(np.int64)
-    begin = np.zeros(len(edge))
-    for a, b in pairwise(first.tolist()):
-        begin[a + 1 : b] = np.cumsum(length[edge[a : b - 1]]) if b > a else 0.0
-    return Ways(first, edge, begin)
 
 
 def places(

@@ -20,7 +20,8 @@ from numba import njit
 
 from trainctl.kernels import keep_by_sources
 from trainctl.signals import Bools, Floats, Ints
-from trainctl.topology.along import Net, Order, Ways
+from trainctl.topology.along import Net, Order
+from trainctl.topology.ways import Ways
 
 keep_by_sources()  # before anything below is decorated
 
@@ -152,8 +153,9 @@ def claim(
         if room[i] < np.inf:  # it does not even have the one before this one
             blocker = int(by[i])
         elif blocker < 0:
-            rest = _needed_too(trains, i, k, clearance, leading, granted)
+            rest, in_front = _needed_too(trains, i, k, clearance, leading, granted, queues)
             later = held.blocker(i, rest)
+            later = in_front if later < 0 else later
             blocker = max(held.blocker(i, [k]), waiting.blocker(i, [k]), key=lambda j: j >= 0)
             if blocker < 0:
                 blocker = later if later >= 0 else waiting.blocker(i, rest)
@@ -291,9 +293,13 @@ def _leading(trains: _Trains, near: dict[tuple[int, int], int], granted: dict[tu
 
 
 def _needed_too(
-    trains: _Trains, i: int, k: int, clearance: float, leading: dict[int, set[int]], granted: dict[tuple[int, int], bool]
-) -> list[int]:
-    """First rows of the stretches ``i`` needs together with that of row k, since it could not stand between them."""
+    trains: _Trains, i: int, k: int, clearance: float, leading: dict[int, set[int]], granted: dict[tuple[int, int], bool],
+    queues: dict[int, list[int]],
+) -> tuple[list[int], int]:  # fmt: skip
+    """First rows of the stretches ``i`` needs together with that of row k, since it could not stand between them.
+
+    Also a train that stands there before ``i`` and has no leave to go on, or -1.
+    """
     zones = trains.zones
     begin, edge = zones.ways.begin, zones.ways.edge
     found: list[int] = []
@@ -306,8 +312,14 @@ def _needed_too(
         if sum(trains.length[j] + clearance for j in {i, *standing}) <= room or granted.get((i, e), False):
             break
         found.append(after)
+        for j in sorted(standing):
+            m = int(trains.row[j])
+            while edge[m] != e:
+                m += 1
+            if trains.goes_before(j, m, i, after, queues):
+                return found, j
         k = after
-    return found
+    return found, -1
 
 
 @njit(cache=True)
