@@ -146,7 +146,7 @@ class Rails:
 
     def path(self, start: int, end: int) -> Ints | None:
         """The shortest way from one edge to another without a change of direction, shape (W,), with both; None if there is none."""
-        best, came, heap = {start: 0.0}, {start: -1}, [(0.0, start)]
+        came, heap = {start: -1}, [(0.0, start)]
         while heap:
             run, here = heappop(heap)
             if here == end:
@@ -154,13 +154,10 @@ class Rails:
                 while (previous := came[found[-1]]) >= 0:
                     found.append(previous)
                 return np.array(found[::-1], np.int64)
-            if run > best[here]:
-                continue
             for there in self.onward[here]:
-                further = run + float(self.length_m[there])
-                if further < best.get(there, np.inf):
-                    best[there], came[there] = further, here
-                    heappush(heap, (further, there))
+                if there not in came:  # entered first from the nearest: an edge costs the same from wherever it is entered
+                    came[there] = here
+                    heappush(heap, (run + float(self.length_m[there]), there))
         return None
 
 

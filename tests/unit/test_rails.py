@@ -311,7 +311,8 @@ def test_a_place_to_wait_on_a_junction_makes_a_chain(convert):
     agrees(rails, net, ["sc", "cw"], vehicle_class="tram")
 
 
-def test_roads_are_left_out_and_the_lane_for_trains_counts(convert, tmp_path):
+@pytest.mark.parametrize("option", ["--no-turnarounds", "--no-internal-links"])
+def test_roads_are_left_out_and_the_lane_for_trains_counts(convert, tmp_path, option):
     nodes = {"a": (0, 0), "b": (400, 0), "c": (800, 0), "d": (400, 300)}
     edges = {"ab": "a b", "bc": "b c", "bd": "b d"}
     net = convert(nodes, edges, "", lane='numLanes="2" allow="passenger bicycle"')
@@ -323,7 +324,7 @@ def test_roads_are_left_out_and_the_lane_for_trains_counts(convert, tmp_path):
         words = re.sub(rf'(<edge id="{edge}"[^>]*) allow="passenger bicycle" */>', rf"\1>{lanes}</edge>", words)
     (tmp_path / "e.xml").write_text(words)
     program, environment = netconvert()
-    command = [str(program), "-n", "n.xml", "-e", "e.xml", "-o", "x.net.xml"]
+    command = [str(program), "-n", "n.xml", "-e", "e.xml", option, "-o", "x.net.xml"]
     subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True)
     assert 'from="ab" to="bd"' in net.read_text()  # for bicycles
     rails = Rails.read(net)
