@@ -265,7 +265,9 @@ def prepare(scenario: Scenario, file: str, folder: Path, known: Sequence[str] = 
     ]  # fmt: skip
     if network is not None:
         prepared = replace(prepared, line=network[0], spec=network[1], net=network[2])
-        found += [*prepare_line.long_enough(prepared), *prepare_line.steep(prepared)]
+        if law.CLOCK != "none":  # such trains leave at the line's end
+            found += prepare_line.long_enough(prepared)
+        found += prepare_line.steep(prepared)
     if found:
         # What follows from a key that is wrong already is not a mistake of its own.
         wrong = [line.partition(" = ")[0].partition(":")[0].rpartition(".")[2] for line in known]
@@ -410,6 +412,8 @@ def _fits(p: Prepared) -> list[str]:
             clamp, bound = getattr(p.plant_params, key), getattr(p.scenario.bounds, key)
             if clamp != bound:
                 found.append(f"plant.{key} = {clamp}: must be [bounds] {key} = {bound}, this law's model clamps there")
+    if p.law.CLOCK == "none":
+        return found + list(p.law.unfit(p.scenario))
     found += [*_messages_fit(p), *_disturbances_fit(p)]
     if p.scenario.plant.kind != "point" and p.sampled:
         least, greatest = _room(p.scenario, p.consists)

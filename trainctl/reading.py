@@ -60,9 +60,12 @@ def load(name: str, overrides: dict[str, Any] | None = None) -> tuple[Scenario, 
 
 
 def read(name: str, overrides: dict[str, Any] | None = None) -> tuple[dict[str, Any], Path]:
-    """The tables of a scenario as they stand, and its file."""
+    """The tables of a scenario as they stand, and its file. With another law the keys of the file's law are left out."""
     path = find(name)
     data = _read(path)
+    table, law = data.get("controller"), (overrides or {}).get("controller.law")
+    if law is not None and isinstance(table, dict) and table.get("law") != law:
+        data["controller"] = {}
     for key, value in (overrides or {}).items():
         _set(data, key, value)
     return data, path

@@ -88,6 +88,12 @@ def run(
     TrainctlError
         The run failed; ``out.partial`` keeps what was recorded, and run.json says why and when.
     """
+    if p.law.CLOCK == "none":
+        if backend != "sumo" or gui is not None or checkpoint_every_s is not None:
+            raise InputError("controller.law = sumo: SUMO drives by itself: no --backend numeric, --gui or --checkpoint-every")
+        from trainctl.sumo import baseline
+
+        return baseline.run(p, out, force, command_line, progress)
     with opened(p, out, backend, force, command_line, gui, checkpoint_every_s) as simulation:
         simulation.run(progress)
     return Run(out)
@@ -107,6 +113,8 @@ def opened(
 
     When the block ends the run is complete; when it raises, the run failed.
     """
+    if p.law.CLOCK == "none":
+        raise InputError("controller.law = sumo: SUMO drives by itself; `trainctl run` runs it")
     every = checkpoint_every_s
     step = p.scenario.run.step_s
     if every is not None and not (every >= step and abs(every / step - round(every / step)) < 1e-6):

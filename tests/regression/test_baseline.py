@@ -1,0 +1,200 @@
+"""SUMO's own trains through us and without us: the same traffic; blocks that hold; a record like any other run's."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sumo_net.build import netconvert
+from trainctl import runner
+from trainctl.errors import InputError
+from trainctl.prepare import open_scenario
+from trainctl.reading import examine
+from trainctl.record.run import Run
+from trainctl.signals import GRAVITY
+
+SECTION = 24000.0
+
+
+def scenario(folder: Path, *, trains: int = 6, line: Mapping[str, Any] | None = None, **controller: Any) -> Path:
+    """A line of 30 km and trains that wait at its kilometre 1, in the order of their tables."""
+    import tomli_w
+
+    spec = {"name": "short", "tracks": ["1"], "length_m": 30000.0, "speed": [[0.0, 83.333]]} | dict(line or {})
+    (folder / "short.toml").write_text(tomli_w.dumps(spec))
+    tables = {
+        "schema_version": 1, "title": "SUMO's own trains", "run": {"duration_s": 1500.0, "step_s": 1.0},
+        "network": {"line": "short.toml"}, "controller": {"law": "sumo", "entry_m": 1000.0} | controller,
+        "reference": {"speed_mps": 83.333}, "topology": {"spacing_m": 3000.0}, "bounds": {"speed_upper_mps": 83.333},
+        "train_type": {"ice3": {
+            "unit_length_m": 200.0, "unit_mass_kg": 420e3, "rotating_mass_factor": 1.04,
+            "c0_n_per_kg": 0.0177, "c1_ns_per_m_kg": 3e-4, "c2_ns2_per_m2_kg": 1.85e-5,
+        }},
+        "train": [{"id": k + 1, "type": "ice3", "track": "1", "position_m": 25000.0 - 3000.0 * k, "speed_mps": 0.0}
+                  for k in range(trains)],
+    }  # fmt: skip
+    path = folder / "short_scenario.toml"
+    path.write_text(tomli_w.dumps(tables))
+    return path
+
+
+def run(path: Path, out: Path, **overrides: Any) -> Run:
+    return runner.run(open_scenario(str(path), overrides), out)
+
+
+def passages(frame: Any, at: float) -> np.ndarray:
+    """Times at which fronts pass a kilometrage."""
+    found = []
+    for _, rows in frame.groupby("train", observed=True):
+        x, t = rows["position_m"].to_numpy(), rows["time_s"].to_numpy()
+        if x[0] < at <= x[-1]:
+            found.append(np.interp(at, x, t))
+    return np.sort(found)
+
+
+def without_us(folder: Path, net: Path, moving: bool, trains: int = 6) -> np.ndarray:
+    """Passages at the section as a detector of SUMO's sees them, with routes of this test's own."""
+    edges = [e.get("id") for e in ElementTree.parse(net).iter("edge") if e.get("function") != "internal"]
+    edges.sort(key=lambda name: float(str(name).partition("_")[2]))
+    on = next(e for e in reversed(edges) if float(e.partition("_")[2]) < SECTION)
+    first = next(e for e in reversed(edges) if float(e.partition("_")[2]) <= 1000.0)
+    (folder / "own.rou.xml").write_text(
+        '<routes><vType id="t" vClass="rail" carFollowModel="Rail" trainType="ICE3" maxSpeed="83.333" speedFactor="1" speedDev="0"/>'
+        f'<route id="r" edges="{" ".join(edges[edges.index(first) :])}"/>'
+        + "".join(
+            f'<vehicle id="v{k}" type="t" route="r" depart="0" departPos="{1000 - float(first.partition("_")[2])}"/>'
+            for k in range(trains)
+        )
+        + "</routes>"
+    )
+    at = SECTION - float(on.partition("_")[2])
+    (folder / "own.add.xml").write_text(
+        f'<additional><instantInductionLoop id="d" lane="{on}_0" pos="{at}" file="own.det.xml"/></additional>'
+    )
+    program, environment = netconvert()
+    command = [str(program.parent / "sumo"), "-n", str(net), "-r", "own.rou.xml", "-a", "own.add.xml", "-e", "1500"]
+    command += ["--time-to-teleport", "-1", "--no-step-log", "--no-warnings", "--default.speeddev", "0", "--no-internal-links"]
+    subprocess.run([*command, *(["--railsignal-moving-block"] if moving else [])], cwd=folder, env=environment, check=True)
+    events = ElementTree.parse(folder / "own.det.xml").iter("instantOut")
+    return np.sort([float(e.get("time", "nan")) for e in events if e.get("state") == "enter"])
+
+
+@pytest.mark.parametrize(("block", "signals_m"), [("fixed", 2000.0), ("fixed", 5000.0), ("moving", 2000.0)])
+def test_headways_are_those_of_sumo_without_us(tmp_path: Path, block: str, signals_m: float) -> None:
+    ours = passages(run(scenario(tmp_path, block=block, signals_m=signals_m), tmp_path / "run").trains, SECTION)
+    theirs = without_us(tmp_path, tmp_path / "run" / "sumo" / "short.net.xml", block == "moving")
+    assert len(ours) == len(theirs) == 6
+    print(block, signals_m, np.diff(ours).round(2), np.diff(theirs).round(2))
+    np.testing.assert_allclose(np.diff(ours), np.diff(theirs), atol=1.0)
+
+
+def test_a_block_holds_one_train_and_moving_block_does_not(tmp_path: Path) -> None:
+    most = {}
+    for block in ("fixed", "moving"):
+        trains = run(scenario(tmp_path, block=block, signals_m=5000.0), tmp_path / block).trains
+        front = np.floor(trains["position_m"] / 5000.0)
+        most[block] = trains.assign(block=front).groupby(["time_s", "block"], observed=True).size().max()
+    assert most["fixed"] == 1 and most["moving"] > 1, most
+
+
+def test_energies_balance_with_the_kinetic_energy(tmp_path: Path) -> None:
+    hilly = {"gradient": [[5000.0, 8.0], [9000.0, -6.0], [12000.0, 0.0]]}
+    path = scenario(tmp_path, trains=2, block="moving", line=hilly)
+    done = run(path, tmp_path / "run", **{"run.record_every_s": 7.0, "run.duration_s": 350.0})
+    for _, rows in done.trains.groupby("train", observed=True):
+        gained = 0.5 * 420e3 * 1.04 * (rows["speed_mps"].iloc[-1] ** 2 - rows["speed_mps"].iloc[0] ** 2)
+        sums = rows[["traction_j", "braking_j", "resistance_j", "gradient_j"]].iloc[1:].sum()
+        balance = sums["traction_j"] - sums["braking_j"] - sums["resistance_j"] - sums["gradient_j"]
+        assert gained == pytest.approx(balance, rel=1e-9, abs=1.0)
+        climbed = 420e3 * GRAVITY * (8e-3 * 4000.0 - 6e-3 * 3000.0)
+        assert rows["position_m"].iloc[-1] > 12200.0
+        assert sums["gradient_j"] == pytest.approx(climbed, abs=420e3 * GRAVITY * 8e-3 * 83.333)  # slopes change once per step
+
+
+def test_the_resistance_and_traction_are_those_of_sumos_table(tmp_path: Path) -> None:
+    """SUMO's ICE3 has 300 kN at first and resists with 7.4 kN; at 300 km/h it resists with 71.8 kN. 436.8 t with rotating mass."""
+    trains = run(scenario(tmp_path, trains=1, block="moving", entry_speed_mps=0.0), tmp_path / "run").trains
+    speed = trains["speed_mps"].to_numpy()
+    force = 436.8e3 * np.diff(speed)
+    assert force[0] == pytest.approx((300.0 - 7.4) * 1000.0, rel=1e-6)
+    at = np.searchsorted(speed, 270.0 / 3.6) - 1
+    expected = np.interp(speed[at] * 3.6, [260.0, 270.0], [111.0 - 56.6, 107.0 - 60.3]) * 1000.0
+    assert force[at] == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_shipped_traffic_runs_under_sumo_and_its_record_is_read(tmp_path: Path) -> None:
+    done = runner.run(open_scenario("three_tracks", {"controller.law": "sumo", "controller.block": "moving"}), tmp_path / "run")
+    assert done.info["status"] == "complete" and done.info["steps"] == 2400
+    changes = {(e["train"], e["track"]) for e in done.events if e["kind"] == "join"}
+    assert changes == {("2", "3"), ("5", "1")}
+    assert done.metrics["traffic.collisions"] == 0 and done.metrics["traffic.gap_min_m"] > 0.0
+    first = done.trains[done.trains["time_s"] == 0.0].set_index("train")
+    assert first["position_m"].to_dict() == pytest.approx({t["id"]: t["position_m"] for t in done.scenario["train"]})
+    from trainctl.record.figures import plot
+    from trainctl.record.report import report
+
+    assert report(done, None).stat().st_size > 10_000
+    assert len(plot(done, tmp_path / "figures", ("png",), "double")) >= 2
+
+
+def test_trains_that_find_no_place_are_told(tmp_path: Path) -> None:
+    done = run(scenario(tmp_path, signals_m=20000.0), tmp_path / "run", **{"run.duration_s": 60.0})
+    assert [e["trains"] for e in done.events if e["kind"] == "not_entered"] == [["2", "3", "4", "5", "6"]]
+
+
+@pytest.mark.parametrize(
+    ("keys", "line"),
+    [
+        ({"entry_m": 31000.0}, "controller.entry_m = 31000: off the line, 0 .. 30000 m"),
+        ({"entry_m": None, "entry_speed_mps": 5.0}, "controller.entry_speed_mps = 5: only with entry_m"),
+        ({"block": "half"}, "controller.block = half: input should be 'fixed' or 'moving'"),
+        ({"train_type": "TGV"}, "controller.train_type = TGV: input should be 'Freight'"),
+        ({"signals_m": 30000.0}, "controller.signals_m = 30000.0: input should be less than or equal to 20000"),
+    ],
+)
+def test_mistakes_are_one_line(tmp_path: Path, keys: dict[str, Any], line: str) -> None:
+    given = {key: value for key, value in ({"entry_m": 1000.0} | keys).items() if value is not None}
+    path = scenario(tmp_path)
+    data = open_scenario(str(path)).scenario.model_dump(mode="json", exclude_none=True)
+    import tomli_w
+
+    path.write_text(tomli_w.dumps(data | {"controller": {"law": "sumo"} | given, "network": {"line": "short.toml"}}))
+    with pytest.raises(InputError) as caught:
+        run(path, tmp_path / "run")
+    assert any(line in mistake for mistake in caught.value.mistakes), caught.value.mistakes
+    assert not (tmp_path / "run").exists() and not (tmp_path / "run.partial").exists()
+
+
+def test_what_sumo_would_not_feel_is_refused() -> None:
+    from trainctl.prepare import prepare
+    from trainctl.reading import read
+
+    data, path = read("fault_tolerant")
+    data["controller"] = {"law": "sumo"}
+    checked, found = examine(data)
+    assert checked is not None
+    with pytest.raises(InputError, match="fault: SUMO's own trains take none"):
+        prepare(checked, path.name, path.parent, found)
+
+
+def test_it_drives_by_itself(tmp_path: Path) -> None:
+    p = open_scenario("three_tracks", {"controller.law": "sumo"})
+    with pytest.raises(InputError, match="SUMO drives by itself"):
+        runner.run(p, tmp_path / "run", backend="numeric")
+    with pytest.raises(InputError, match="SUMO drives by itself"), runner.opened(p, tmp_path / "run"):
+        pass
+
+
+def test_the_same_run_gives_the_same_record(tmp_path: Path) -> None:
+    path = scenario(tmp_path, trains=3)
+    pieces = [run(path, tmp_path / name) for name in ("a", "b")]
+    for file in ("trains.parquet", "events.jsonl"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+    assert json.dumps(pieces[0].metrics) == json.dumps(pieces[1].metrics)

@@ -1,0 +1,72 @@
+"""SUMO's own trains: no law of ours. SUMO's ``Rail`` model drives under fixed or under moving block, the baseline to compare with.
+
+SUMO decides on every speed (its default speed mode stays on), we only read: see ``trainctl.sumo.baseline``. Of the scenario it
+takes the line, the trains with their lengths, places and speeds, and the reroutes. Masses, resistances and slopes serve to tell
+what the trains' motion costs; bounds are only watched; links, plant and reference play no part, but for the top speed.
+
+Fixed block: one train between two signals; a train enters a block only with the braking distance ahead of it reserved. Moving
+block: the rear of the train ahead is the end of the authority, at the absolute braking distance plus 50 m; signals are there, but
+guard only where ways meet. The braking is that of ``train_type`` (ICE3: 0.5 m/s2).
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field
+
+from trainctl.signals import Scene, Table
+
+CLOCK: Literal["none"] = "none"
+
+#: Whatever the scenario's plant is, it does not move these trains.
+PLANTS = ("point", "coupled_units", "actuated_units")
+OBSERVERS = ("none", "asymptotic", "intermediate")
+
+#: Distance of signals where neither the scenario nor its line states one [m].
+SIGNALS_M = 2000.0
+
+#: Beyond this SUMO gives a block up.
+LONGEST_BLOCK_M = 20_000.0
+
+
+class Params(Table):
+    """Keys of ``[controller]`` with ``law = "sumo"``."""
+
+    block: Literal["fixed", "moving"] = Field(
+        "fixed", description="fixed: one train between two signals; moving: up to the train ahead (--railsignal-moving-block)."
+    )
+    signals_m: float | None = Field(
+        None, ge=10, le=LONGEST_BLOCK_M,
+        description="Distance of the signals [m]; default the line's own signals_m, or 2000 where it has none.",
+    )  # fmt: skip
+    train_type: Literal[
+        "Freight", "ICE1", "ICE3", "MireoPlusB", "MireoPlusH", "NGT400", "NGT400_16", "RB425", "RB628", "REDosto7"
+    ] = Field("ICE3", description="SUMO's table of traction, resistance, mass and braking that drives the trains.")
+    top_speed_mps: float | None = Field(
+        None, gt=0, description="Greatest speed of every train [m/s]; default its upper speed bound, else the reference's greatest."
+    )
+    entry_m: float | None = Field(
+        None, ge=0,
+        description="All trains wait there [m], each on its track, and enter in the order of the [[train]] tables as soon as SUMO "
+        "lets them; default: at time 0 every train is where its [[train]] table says.",
+    )  # fmt: skip
+    entry_speed_mps: float | None = Field(
+        None, ge=0, description="With entry_m: speed at which they enter [m/s]; default SUMO's choice, as fast as is safe."
+    )
+
+
+def violations(params: Params, scene: Scene) -> list[str]:
+    """What these trains ask of a scenario."""
+    found = []
+    if params.entry_m is None and params.entry_speed_mps is not None:
+        found.append(f"controller.entry_speed_mps = {params.entry_speed_mps:g}: only with entry_m")
+    return found
+
+
+def unfit(scenario: Any) -> list[str]:
+    """Parts of a ``scenario`` (``trainctl.scenario.Scenario``) that SUMO's own trains would not feel."""
+    found = [f"{key}: SUMO's own trains take none" for key in ("disturbance", "fault") if getattr(scenario, key)]
+    if scenario.network.net is not None and scenario.controller.keys().get("signals_m") is not None:
+        found.append("controller.signals_m: network.net has the signals it has; build it with signals_m, or name its line")
+    return found
