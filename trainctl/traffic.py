@@ -219,7 +219,8 @@ def read_traffic(sumocfg: Path, work: Path, end_s: float | None = None, seed: in
     if wrong:
         raise InputError(list(dict.fromkeys(wrong)))
     if not departures:
-        raise InputError(f"{sumocfg}: no train departs between begin = {begin:g} and end = {min(ends) if ends else -1:g}")
+        until = f" and before end = {min(ends):g}" if ends else ""
+        raise InputError(f"{sumocfg}: no train departs at begin = {begin:g} or later{until}")
     departures.sort(key=lambda d: (d[1].depart_s, d[0]))
     used = {d.kind for _, d in departures}
     return Traffic(
@@ -296,6 +297,13 @@ def _seconds(text: str) -> float:
     return value
 
 
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
 def _is_time(text: str) -> bool:
     try:
         return math.isfinite(_seconds(text))
@@ -335,10 +343,13 @@ def _tracks(net: Path) -> _Tracks:
         file = read_net(net)
     except LineError as error:
         raise InputError(error.mistakes) from None
-    length = {lane["id"]: float(lane["length"]) for edge in file.edges for lane in edge.lanes}
     onward: dict[str, set[str]] = {edge.attributes.get("id", ""): set() for edge in file.edges}
-    for c in file.connections:
-        onward.setdefault(c["from"], set()).add(c["to"])
+    try:
+        length = {lane["id"]: float(lane["length"]) for edge in file.edges for lane in edge.lanes}
+        for c in file.connections:
+            onward.setdefault(c["from"], set()).add(c["to"])
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{net}: not a SUMO net: a lane or a connection has no {error}") from None
     return _Tracks(length, onward)
 
 
@@ -418,6 +429,8 @@ def _rail(demand: _Demand, kinds: dict[str, Kind]) -> tuple[list[Element], list[
     ]
     speeds = {t.get("departSpeed", "") for t in trains} & {"random", "last", "avg"}
     notes += [f'departSpeed="{s}": as fast as allowed' for s in sorted(speeds)]
+    if any(t.get("arrivalPos") == "random" for t in trains):
+        notes.append('arrivalPos="random": at the end of the edge')
     if n := sum(t.get("arrivalSpeed") is not None for t in trains):
         notes.append(f"{n} trains, trips and flows with an arrivalSpeed: it is not followed")
     if n := sum(t.get("speedFactor") is not None for t in trains):
@@ -587,7 +600,7 @@ def _expand(
         raise InputError(error.mistakes) from None
     except subprocess.TimeoutExpired:
         raise InputError(f"duarouter: no end after {PATIENCE_S:g} s; does a flow have no end?") from None
-    wrong = _told(done.stderr)
+    wrong = _told(done.stderr, {train.get("id", ""): train.tag for train in trains})
     if wrong:
         raise InputError(wrong)
     if done.returncode != 0 or not made.exists():
@@ -611,7 +624,7 @@ def _mix(mix: Element) -> Element:
     return bare
 
 
-def _told(words: str) -> list[str]:
+def _told(words: str, tags: dict[str, str]) -> list[str]:
     """Mistakes in what duarouter says: the line before the one that names the train says which edges."""
     wrong, gap = [], ""
     for line in words.splitlines():
@@ -619,11 +632,13 @@ def _told(words: str) -> list[str]:
         if found := re.search(r"No connection between edge '(.*)' and edge '(.*)' found", said):
             gap = f"no way from edge {found[1]} to edge {found[2]}"
         elif found := re.search(r"Mandatory edge '(.*)' not reachable by vehicle '(.*)'", said):
-            wrong.append(f"train {found[2]}: {gap or f'edge {found[1]} cannot be reached'}")
+            name = found[2] if found[2] in tags else found[2].rpartition(".")[0]
+            who = "flow" if tags.get(name) == "flow" else "train"
+            wrong.append(f"{who} {name}: {gap or f'edge {found[1]} cannot be reached'}")
             gap = ""
         elif line.startswith("Error") and "No route input" not in said:
             wrong.append(f"duarouter: {said}")
-    return wrong
+    return list(dict.fromkeys(wrong))
 
 
 def _departure(vehicle: Element, source: Element, kind: Kind, demand: _Demand, tracks: _Tracks) -> tuple[Departure, list[str]]:
@@ -655,15 +670,26 @@ def _departure(vehicle: Element, source: Element, kind: Kind, demand: _Demand, t
     if wrong:
         return departure, wrong
     first, last = (tracks.length[f"{e}_0"] for e in (edges[0], edges[-1]))
-    try:
-        position = _depart_position(source.get("departPos", "base"), kind.length_m, first, departure)
-        arrival = source.get("arrivalPos", "max")
-        arrival_m = None if arrival in ("max", "random") else float(arrival) + (last if float(arrival) < 0 else 0.0)
-        # Without a word of it SUMO lets rail vehicles, and no others, begin as fast as they may.
-        speed = source.get("departSpeed", "max")
-        speed_mps = None if speed in ("max", "desired", "speedLimit", "last", "avg", "random") else float(speed)
-    except ValueError as error:
-        return departure, [f"train {name}: departPos, departSpeed, arrivalPos: {error}"]
+    words = {
+        "departPos": ("base", "stop", "random", "free", "random_free", "last", "splitFront"),
+        "departSpeed": ("max", "desired", "speedLimit", "last", "avg", "random"),
+        "arrivalPos": ("max", "random", "center"),
+    }
+    wrong = [
+        f"train {name}: {key} = {source.get(key)}: must be a number or one of {', '.join(known)}"
+        for key, known in words.items()
+        if source.get(key, known[0]) not in known and not _is_number(source.get(key, ""))
+    ]
+    if wrong:
+        return departure, wrong
+    position = _depart_position(source.get("departPos", "base"), kind.length_m, first, departure)
+    arrival = source.get("arrivalPos", "max")
+    arrival_m = last / 2 if arrival == "center" else None
+    if _is_number(arrival):
+        arrival_m = min(max(float(arrival) + (last if float(arrival) < 0 else 0.0), 0.0), last)  # as in SUMO
+    # Without a word of it SUMO lets rail vehicles, and no others, begin as fast as they may.
+    speed = source.get("departSpeed", "max")
+    speed_mps = float(speed) if _is_number(speed) else None
     if not 0.0 <= position <= first:
         wrong.append(f"train {name}: departPos = {source.get('departPos')}: off edge {edges[0]}, which is {first:g} m long")
     if stops and stops[0].edge == edges[0] and position >= stops[0].position_m:
