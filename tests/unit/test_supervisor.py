@@ -85,6 +85,7 @@ def test_the_nearest_bind_names_kind_and_row():
     verdict = judged([24.0, 20.0], far, near, limits=limits)
     assert verdict.reason.tolist() == [SWITCH, LIMIT] and verdict.target.tolist() == [1, 1]
     assert verdict.greatest[1] == 0.0
+    assert judged(24.0, far, near, near).target[0] == 1  # of equals the first
 
 
 def test_opposing_trains_share_what_is_left_of_the_way():
