@@ -128,11 +128,11 @@ def claim(
     stretches: dict[tuple[int, int], int] = {}
     for i, k, is_join in zip(*(a.tolist() for a in at), strict=True):
         (joins if is_join else stretches).setdefault((i, int(edge[k])), k)
-    trains = _Trains(zones, row, s, length)
+    trains = _Trains(zones, row, s, length, *_coming(zones, row, present))
 
     queues, said = _turns(trains, state["joins"], joins)
     order, granted = _queue(trains, state["stretches"], stretches, queues)
-    new = set(order) - {(i, e) for i, e, _ in state["stretches"]}
+    new = granted.keys() - {(i, e) for i, e, _ in state["stretches"]}
     held, waiting = _Index(zones, trains), _Index(zones, trains)
     for key in order:
         if granted[key] or (s[key[0]] > begin[stretches[key]] and not outside[key[0]]):
@@ -140,7 +140,10 @@ def claim(
                 said.append(Decision(*key, True, -1, False))
             granted[key] = True
             held.add(key[0], [stretches[key]])
-    leading = _leading(trains, stretches, granted)
+    leading: dict[int, set[int]] = {}
+    for key in order:
+        if granted[key]:
+            _lead(leading, zones, key[0], stretches[key])
     room, zone, by = np.full(len(row), np.inf), np.full(len(row), -1, np.int64), np.full(len(row), -1, np.int64)
     behind: dict[int, int] = {}
     for key in list(order):
@@ -178,7 +181,7 @@ def claim(
                 said.append(Decision(*one, True, -1, False))
             granted[one] = True
             until[i] = max(until[i], begin[r])
-        leading = _leading(trains, stretches, granted)
+            _lead(leading, zones, i, r)
     now = State(
         joins={str(e): queue for e, queue in queues.items()},
         stretches=[(i, e, granted[i, e]) for i, e in order],
@@ -194,6 +197,13 @@ class _Trains(NamedTuple):
     row: Ints
     s: Floats
     length: Floats
+    entry: Ints  # edges over which trains enter their next stretch, ascending
+    comer: Ints  # those trains
+
+    def coming(self, e: int) -> list[int]:
+        """Trains whose next stretch begins with edge ``e``."""
+        found: list[int] = self.comer[np.searchsorted(self.entry, e) : np.searchsorted(self.entry, e, side="right")].tolist()
+        return found
 
     def distance(self, i: int, k: int) -> float:
         return float(self.zones.ways.begin[k] - self.s[i])
@@ -223,12 +233,8 @@ def _turns(
         if (i, e) in known:
             continue
         queue = queues.setdefault(e, [])
-        turn = len(queue)
-        for t, j in enumerate(queue):
-            m = near[j, e]
-            if edge[m - 1] == edge[k - 1] and trains.goes_before(i, k, j, m, queues):
-                turn = t
-                break
+        same = (t for t, j in enumerate(queue) if edge[near[j, e] - 1] == edge[k - 1])
+        turn = next((t for t in same if trains.goes_before(i, k, queue[t], near[queue[t], e], queues)), len(queue))
         queue.insert(turn, i)
         others = [j for j in queue[:turn] if edge[near[j, e] - 1] != edge[k - 1]]
         said.append(Decision(i, e, not others, others[-1] if others else -1, True))
@@ -241,15 +247,16 @@ def _queue(
     """Claims of stretches in order, and whether they are granted; new ones last, unless they go before another over that edge."""
     granted = {(i, e): bool(g) for i, e, g in before if (i, e) in near}
     order = list(granted)
+    over: dict[int, list[int]] = {}  # trains in order, by edge
+    for i, e in order:
+        over.setdefault(e, []).append(i)
     for (i, e), k in sorted(near.items(), key=lambda item: (trains.distance(item[0][0], item[1]), item[0])):
         if (i, e) in granted:
             continue
-        place = len(order)
-        for t, (j, f) in enumerate(order):
-            if f == e and trains.goes_before(i, k, j, near[j, f], queues):
-                place = t
-                break
-        order.insert(place, (i, e))
+        queue = over.setdefault(e, [])
+        turn = next((t for t, j in enumerate(queue) if trains.goes_before(i, k, j, near[j, e], queues)), len(queue))
+        order.insert(order.index((queue[turn], e)) if turn < len(queue) else len(order), (i, e))
+        queue.insert(turn, i)
         granted[i, e] = False
     return order, granted
 
@@ -282,14 +289,20 @@ class _Index:
         return -1
 
 
-def _leading(trains: _Trains, near: dict[tuple[int, int], int], granted: dict[tuple[int, int], bool]) -> dict[int, set[int]]:
-    """Trains let into a stretch, by the edge over which they enter the one after it."""
-    found: dict[int, set[int]] = {}
-    for (i, e), is_granted in granted.items():
-        after = trains.zones.following[near[i, e]]
-        if is_granted and after >= 0:
-            found.setdefault(int(trains.zones.ways.edge[after]), set()).add(i)
-    return found
+def _lead(leading: dict[int, set[int]], zones: Zones, i: int, k: int) -> None:
+    """Note that train ``i`` was let into the stretch at row k, under the edge over which it enters the one after it."""
+    after = zones.following[k]
+    if after >= 0:
+        leading.setdefault(int(zones.ways.edge[after]), set()).add(i)
+
+
+def _coming(zones: Zones, row: Ints, present: Bools) -> tuple[Ints, Ints]:
+    """Edges over which trains enter their next stretch, ascending, and those trains."""
+    train = np.flatnonzero(present)
+    train = train[zones.following[row[train]] >= 0]
+    entry = zones.ways.edge[zones.following[row[train]]]
+    by_edge = np.argsort(entry, kind="stable")
+    return entry[by_edge], train[by_edge]
 
 
 def _needed_too(
@@ -303,12 +316,11 @@ def _needed_too(
     zones = trains.zones
     begin, edge = zones.ways.begin, zones.ways.edge
     found: list[int] = []
-    coming = zones.following[trains.row]
     while (after := int(zones.following[k])) >= 0:
         e = int(edge[after])
         room = begin[after] - begin[zones.ends[k] + 1]
-        between = np.flatnonzero((coming >= 0) & (edge[coming] == e) & (begin[coming] - trains.s <= room))
-        standing = {j for j in {*between.tolist(), *leading.get(e, ())} if j != i and not granted.get((j, e), False)}
+        between = [j for j in trains.coming(e) if trains.distance(j, int(zones.following[trains.row[j]])) <= room]
+        standing = {j for j in {*between, *leading.get(e, ())} if j != i and not granted.get((j, e), False)}
         if sum(trains.length[j] + clearance for j in {i, *standing}) <= room or granted.get((i, e), False):
             break
         found.append(after)
