@@ -7,6 +7,7 @@ position grows along every way like the distance run.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -224,31 +225,24 @@ def _for_trains(lane: dict[str, str]) -> bool:
     return not RAIL.isdisjoint(lane.get("allow", "").split())
 
 
-def _edge_of(lane: str) -> str:
-    return lane.rpartition("_")[0]
-
-
-def _links(connections: list[dict[str, str]], lanes: set[str], bidi: dict[str, str]) -> list[_Link]:
-    """The connections trains can take over the given lanes, one for each pair of edges.
+def _links(connections: list[dict[str, str]], lanes: dict[str, str], inside: dict[str, str], bidi: dict[str, str]) -> list[_Link]:
+    """The connections between lanes over others inside junctions (id: edge) that trains can take, one for each pair of edges.
 
     Where a connection has a place to wait on its junction, its internal lanes are a chain. A train that reverses jumps from an
     edge to its twin (measured: SUMO 1.28 moves it over no internal edge, though the net has one).
     """
-    rows = [
-        (c["from"], c["to"], f"{c['from']}_{c.get('fromLane')}", f"{c['to']}_{c.get('toLane')}", c.get("via"))
-        for c in connections
-        if "from" in c and "to" in c
-    ]
-    further = {leaves: via for begin, _, leaves, _, via in rows if begin.startswith(":") and via is not None}
+    rows = [(f"{c.get('from')}_{c.get('fromLane')}", f"{c.get('to')}_{c.get('toLane')}", c.get("via")) for c in connections]
+    further = {leaves: via for leaves, _, via in rows if leaves in inside}
     found: dict[tuple[str, str], _Link] = {}
-    for begin, end, leaves, enters, via in rows:
-        if begin.startswith(":") or (begin, end) in found or leaves not in lanes or enters not in lanes:
+    for leaves, enters, via in rows:
+        if leaves not in lanes or enters not in lanes or (lanes[leaves], lanes[enters]) in found:
             continue
+        begin, end = lanes[leaves], lanes[enters]
         chain: list[str] = []
-        while via is not None and via not in chain and bidi.get(begin) != end:
+        while via is not None and via not in chain and bidi[begin] != end:
             chain.append(via)
             via = further.get(via)
-        if lanes.issuperset(chain):
+        if inside.keys() >= set(chain):
             found[begin, end] = _Link(begin, end, tuple(chain))
     return list(found.values())
 
@@ -277,16 +271,21 @@ def _measure(lane: dict[str, str]) -> tuple[float, float, Floats]:
 def _rails(net: NetFile, file: str) -> Rails:
     by_id = {e.attributes.get("id", ""): e for e in net.edges}
     lane_of = {name: lane for name, e in by_id.items() if (lane := next(filter(_for_trains, e.lanes), None)) is not None}
-    normal = [by_id[name] for name in lane_of if by_id[name].attributes.get("function", "normal") == "normal"]
+    normal = [name for name in lane_of if by_id[name].attributes.get("function", "normal") == "normal"]
     if not normal:
         raise LineError([f"{file}: has no rail edges: none of its lanes allows a rail class by name"])
-    bidi = {name: e.attributes.get("bidi", "") for name, e in by_id.items()}
-    lanes = {lane.get("id", "") for e in net.edges for lane in e.lanes if _for_trains(lane)}
-    links = _links(net.connections, lanes, bidi)
-    used = {_edge_of(lane) for link in links for lane in link.lanes}
-    ours = not used and all("track" in e.params for e in normal)
-    line = line_of(normal, file) if ours else None
-    names = [*(line.edges if line else (e.attributes.get("id", "") for e in normal)), *(name for name in lane_of if name in used)]
+    within = [name for name in lane_of if by_id[name].attributes.get("function") == "internal"]
+    lanes, inside = (
+        {lane.get("id", ""): name for name in part for lane in by_id[name].lanes if _for_trains(lane)} for part in (normal, within)
+    )
+    bidi = {name: by_id[name].attributes.get("bidi", "") for name in lane_of}
+    links = _links(net.connections, lanes, inside, bidi)
+    uses = Counter(edge for link in links for edge in {inside[lane] for lane in link.lanes})
+    if shared := [name for name in within if uses[name] > 1]:
+        raise LineError([f"{file}: edge {name}: lies on {uses[name]} connections between different edges" for name in shared])
+    ours = not uses and all("track" in by_id[name].params for name in normal)
+    line = line_of([by_id[name] for name in normal], file) if ours else None
+    names = [*(line.edges if line else normal), *(name for name in within if name in uses)]
     rows, mistakes = [], []
     for name in names:
         try:
@@ -299,7 +298,7 @@ def _rails(net: NetFile, file: str) -> Rails:
         raise LineError(mistakes)
     index = {name: k for k, name in enumerate(names)}
     length = np.array([row[0] for row in rows])
-    ways = [tuple(index[edge] for edge in (link.begin, *map(_edge_of, link.lanes), link.end)) for link in links]
+    ways = [tuple(index[edge] for edge in (link.begin, *(inside[lane] for lane in link.lanes), link.end)) for link in links]
     pairs = {pair for way in ways for pair in pairwise(way)}
     after = _neighbours(len(names), pairs)
     reversal = frozenset((index[link.begin], index[link.end]) for link in links if bidi[link.begin] == link.end)
@@ -307,7 +306,7 @@ def _rails(net: NetFile, file: str) -> Rails:
     on = {lane: way for link, way in zip(links, ways, strict=True) for lane in link.lanes}
     return Rails(
         edges=tuple(names),
-        internal=np.array([name in used for name in names]),
+        internal=np.array([name in uses for name in names]),
         length_m=length,
         speed_mps=np.array([row[1] for row in rows]),
         start_m=line.start_m.copy() if line else potential(length, _onward(after, reversal)),
