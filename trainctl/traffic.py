@@ -201,12 +201,18 @@ def read_traffic(sumocfg: Path, work: Path, end_s: float | None = None, seed: in
     ]
     if wrong:
         raise InputError(wrong)
-    kinds = {name: _kind(element) for name, element in demand.types.items()}
+    kinds = {name: _kind(element) for name, element in (_defaults() | demand.types).items()}
     trains, notes = _rail(demand, kinds)
     _refuse(sumocfg, trains, demand, kinds, tracks)
     expanded = _expand(trains, demand, net[0], work, begin, min(ends) if ends else None, seed)
     order = {train.get("id", ""): k for k, train in enumerate(trains)}
-    departures, wrong = [], []
+    made = {vehicle.get("id", "") for vehicle in expanded}
+    departures = []
+    wrong = [
+        f"train {t.get('id')}: duarouter makes no route of it"
+        for t in trains
+        if t.tag != "flow" and t.get("id") not in made and begin <= _departs(t, begin) < min(ends, default=math.inf)
+    ]
     for vehicle in expanded:
         name = vehicle.get("id", "")
         source = trains[order[name if name in order else name.rpartition(".")[0]]]
@@ -297,6 +303,11 @@ def _seconds(text: str) -> float:
     return value
 
 
+def _departs(train: Element, begin: float) -> float:
+    depart = train.get("depart", "begin")
+    return begin if depart == "begin" else _seconds(depart)
+
+
 def _is_number(text: str) -> bool:
     try:
         return math.isfinite(float(text))
@@ -309,6 +320,10 @@ def _is_time(text: str) -> bool:
         return math.isfinite(_seconds(text))
     except ValueError:
         return False
+
+
+def _bad_time(text: str) -> bool:
+    return not _is_time(text) or _seconds(text) < 0
 
 
 def _parse(path: Path) -> Element:
@@ -365,22 +380,28 @@ def _elements(path: Path, within: tuple[Path, ...] = ()) -> Iterator[Element]:
 
 
 def _demand(files: list[Path]) -> _Demand:
-    d = _Demand({"DEFAULT_VEHTYPE": Element("vType", id="DEFAULT_VEHTYPE"),
-                 "DEFAULT_RAILTYPE": Element("vType", id="DEFAULT_RAILTYPE", vClass="rail")}, {}, {}, {}, [], {}, {})  # fmt: skip
+    d = _Demand({}, {}, {}, {}, [], {}, {})
     named = {"vType": d.types, "vTypeDistribution": d.mixes, "route": d.routes, "routeDistribution": d.drawn}
+    wrong = []
     for path in files:
         for element in _elements(path):
-            tag, name = element.tag, element.get("id", "")
+            tag = element.tag
             if tag in _TRAINS:
                 d.trains.append(element)
-            elif tag in named:
-                named[tag][name] = element
-                d.types.update({e.get("id", ""): e for e in element.iter("vType")})
-                d.routes.update({e.get("id", ""): e for e in element.iter("route") if e.get("id") and e.get("edges")})
-            elif tag in _PLACES:
-                d.places[name] = element
+            elif tag in named or tag in _PLACES:
+                # The members of a distribution have a name of their own.
+                members = [e for e in element if tag in ("vTypeDistribution", "routeDistribution") and not e.get("refId")]
+                for e in (element, *members):
+                    table, name = named.get(e.tag, d.places), e.get("id", "")
+                    wrong += [f"{path}: {e.tag} {name}: there are several of this id"] if name in table else []
+                    if name:
+                        table[name] = e
+                    elif e is element:
+                        wrong.append(f"{path}: a {tag} has no id")
             elif tag in _PEOPLE or tag == "rerouter":
                 d.seen[tag] = d.seen.get(tag, 0) + 1
+    if wrong:
+        raise InputError(list(dict.fromkeys(wrong)))
     return d
 
 
@@ -403,6 +424,12 @@ def _kind(element: Element) -> Kind:
         speed_factor=float(factor[0]) if factor else 1.0,
         attributes=said,
     )
+
+
+def _defaults() -> dict[str, Element]:
+    """The vTypes SUMO has of its own that a train may be of."""
+    return {"DEFAULT_VEHTYPE": Element("vType", id="DEFAULT_VEHTYPE"),
+            "DEFAULT_RAILTYPE": Element("vType", id="DEFAULT_RAILTYPE", vClass="rail")}  # fmt: skip
 
 
 def _members(mix: Element) -> list[str]:
@@ -474,7 +501,7 @@ def _refuse(sumocfg: Path, trains: list[Element], demand: _Demand, kinds: dict[s
         wrong += [f"{who}: type = {t}: no such vType" for t in types if t not in kinds]
         if seen[train.get("id", "")] > 1:
             wrong.append(f"{who}: there are several of this id")
-        depart = train.get("depart", "0")
+        depart = train.get("depart", train.get("begin", "0"))
         if depart != "begin" and not _is_time(depart):
             wrong.append(f"{who}: depart = {depart}: must be a time; what a train is to wait for is not known before the run")
         routes = _routes(train, demand)
@@ -514,17 +541,19 @@ def _place(stop: Element, demand: _Demand, tracks: _Tracks) -> _Place:
         where, name = stop, ""
     lane = where.get("lane") or (f"{where.get('edge')}_0" if where.get("edge") else "")
     said = f"stop at {name}" if name else f"stop on edge {lane.rpartition('_')[0]}"
+    if not lane:
+        return _Place(lane, 0.0, "a stop has neither a lane nor an edge nor a place to stop at")
     if lane not in tracks.length:
         return _Place(lane, 0.0, f"{said}: lane {lane}: not in the net")
     length = tracks.length[lane]
-    said_wrong = [f"{key} = {stop.get(key)}" for key in ("duration", "until") if not _is_time(stop.get(key, "0"))]
+    said_wrong = [f"{key} = {stop.get(key)}" for key in ("duration", "until") if _bad_time(stop.get(key, "0"))]
     try:
         position = float(where.get("endPos", length))
     except ValueError:
         said_wrong.append(f"endPos = {where.get('endPos')}")
         position = 0.0
     if said_wrong:
-        return _Place(lane, 0.0, f"{said}: {', '.join(said_wrong)}: must be a number")
+        return _Place(lane, 0.0, f"{said}: {', '.join(said_wrong)}: must be a number, a time not negative")
     position += length if position < 0 else 0.0
     if where.get("friendlyPos", "0").lower() in ("1", "true", "yes", "on", "x", "t"):
         position = min(max(position, 0.0), length)
@@ -564,7 +593,7 @@ def _expand(
     more, routes = Element("additional"), Element("routes")
     more.extend(demand.places.values())
     named = {id(t) for mix in demand.mixes.values() for t in mix}
-    more.extend(t for name, t in demand.types.items() if id(t) not in named and name != "DEFAULT_VEHTYPE")
+    more.extend(t for t in demand.types.values() if id(t) not in named)
     more.extend(demand.mixes.values())
     drawn = {id(r) for mix in demand.drawn.values() for r in mix}
     routes.extend(_route(r) for r in demand.routes.values() if id(r) not in drawn)
@@ -588,6 +617,8 @@ def _expand(
         "begin": f"{begin:.3f}", "seed": str(seed), "precision": "9", "xml-validation": "never", "no-step-log": "true",
         "unsorted-input": "true", "ignore-errors": "true",
     }  # fmt: skip
+    if any(key.endswith(("Junction", "Junctions")) for train in trains for key in train.keys()):  # noqa: SIM118
+        options["junction-taz"] = "true"
     if end is not None:
         options["end"] = f"{end:.3f}"
     made = work / "trains.rou.xml"
@@ -625,20 +656,34 @@ def _mix(mix: Element) -> Element:
 
 
 def _told(words: str, tags: dict[str, str]) -> list[str]:
-    """Mistakes in what duarouter says: the line before the one that names the train says which edges."""
-    wrong, gap = [], ""
+    """Mistakes in what duarouter says, by train: the first line of several about one says the most."""
+    patterns = (
+        (r"Mandatory edge '(.*)' not reachable by vehicle '(.*)'\.", "edge {0} cannot be reached"),
+        (r"Vehicle '(.*)' is not allowed to (.*)\.", "is not allowed to {0}"),
+        (r"The route for vehicle '(.*)' has no edges", "no route"),
+        (r"The route of the vehicle '(.*)' is not known", "no route"),
+        (r"The vehicle '(.*)' has no valid route", "no route"),
+    )
+    wrong: dict[str, str] = {}
+    gap = ""
     for line in words.splitlines():
         _, _, said = line.partition(": ")
-        if found := re.search(r"No connection between edge '(.*)' and edge '(.*)' found", said):
+        if found := re.match(r"No connection between edge '(.*)' and edge '(.*)' found", said):
             gap = f"no way from edge {found[1]} to edge {found[2]}"
-        elif found := re.search(r"Mandatory edge '(.*)' not reachable by vehicle '(.*)'", said):
-            name = found[2] if found[2] in tags else found[2].rpartition(".")[0]
-            who = "flow" if tags.get(name) == "flow" else "train"
-            wrong.append(f"{who} {name}: {gap or f'edge {found[1]} cannot be reached'}")
-            gap = ""
-        elif line.startswith("Error") and "No route input" not in said:
-            wrong.append(f"duarouter: {said}")
-    return list(dict.fromkeys(wrong))
+            continue
+        for pattern, meaning in patterns:
+            if found := re.match(pattern, said):
+                name, *rest = found.groups() if not pattern.startswith("Mandatory") else found.groups()[::-1]
+                name = name if name in tags else name.rpartition(".")[0]
+                who = f"{'flow' if tags.get(name) == 'flow' else 'train'} {name}"
+                wrong.setdefault(who, f"{who}: {gap or meaning.format(*(r.replace(chr(39), '') for r in rest))}")
+                gap = ""
+                break
+        else:
+            follows = said.startswith(("No route input", "Loading of", "Invalid parsing", "vehicle cannot be created"))
+            if line.startswith("Error") and not follows:
+                wrong.setdefault(said, f"duarouter: {said}")
+    return list(wrong.values())
 
 
 def _departure(vehicle: Element, source: Element, kind: Kind, demand: _Demand, tracks: _Tracks) -> tuple[Departure, list[str]]:
@@ -680,6 +725,8 @@ def _departure(vehicle: Element, source: Element, kind: Kind, demand: _Demand, t
         for key, known in words.items()
         if source.get(key, known[0]) not in known and not _is_number(source.get(key, ""))
     ]
+    if source.get("departSpeed", "0").startswith("-"):
+        wrong.append(f"train {name}: departSpeed = {source.get('departSpeed')}: must not be negative")
     if wrong:
         return departure, wrong
     position = _depart_position(source.get("departPos", "base"), kind.length_m, first, departure)

@@ -263,11 +263,18 @@ MISTAKES = {
     f'{V} route="main"><stop trainStop="ghost" duration="3"/></vehicle>': ["train v: stop at trainStop ghost: no such trainStop"],
     f'{V} route="main"><stop lane="bc_0" endPos="20"/></vehicle>': ["train v: stop on edge bc: neither duration nor until"],
     f'{V} route="main"><stop lane="bc_0" endPos="x" duration="y"/></vehicle>': [
-        "train v: stop on edge bc: duration = y, endPos = x: must be a number"
+        "train v: stop on edge bc: duration = y, endPos = x: must be a number, a time not negative"
     ],
     '<vehicle id="v" type="t" depart="triggered" route="main"/>': [
         "train v: depart = triggered: must be a time; what a train is to wait for is not known before the run"
     ],
+    '<flow id="u" type="t" begin="triggered" number="2" route="main"/>': [
+        "flow u: depart = triggered: must be a time; what a train is to wait for is not known before the run"
+    ],
+    f'{V} route="main" departSpeed="-1"/>': ["train v: departSpeed = -1: must not be negative"],
+    f"{V}/>": ["train v: no route"],
+    f'{V}><route edges="zx"/></vehicle>': ["train v: is not allowed to depart on edge zx"],
+    f'{V} route="main"><stop duration="4"/></vehicle>': ["train v: a stop has neither a lane nor an edge nor a place to stop at"],
     f'{V} route="main"/>{V} route="main"/>': ["train v: there are several of this id"],
     '<vType id="bad" vClass="rail" length="long"/>': ["vType bad: length = long: must be a number, not negative"],
     f'{V} route="ghost"/><vehicle id="w" type="ghost" depart="containerTriggered" route="main"/>': [
@@ -281,6 +288,20 @@ MISTAKES = {
 @pytest.mark.parametrize("demand", MISTAKES, ids=range(len(MISTAKES)))
 def test_mistakes_are_told_all_at_once(files: Files, demand: str) -> None:
     assert files.mistakes(demand) == MISTAKES[demand]
+
+
+def test_two_things_of_one_name_are_a_mistake(files: Files) -> None:
+    path = files.folder / "r.rou.xml"
+    assert files.mistakes(f"{ROUTE}{CUSTOM}") == [f"{path}: route main: there are several of this id",
+                                                  f"{path}: vType t: there are several of this id"]  # fmt: skip
+
+
+def test_the_types_sumo_has_of_its_own(files: Files) -> None:
+    assert (
+        files.read('<vehicle id="v" type="DEFAULT_RAILTYPE" depart="0" route="main"/>').kinds["DEFAULT_RAILTYPE"].length_m == 135.0
+    )
+    traffic = files.read('<vType id="DEFAULT_VEHTYPE" vClass="rail" length="33"/><vehicle id="v" depart="0" route="main"/>')
+    assert traffic.departures[0].position_m == pytest.approx(33.1)
 
 
 def test_places_off_the_edge_are_mistakes(files: Files) -> None:
