@@ -8,12 +8,16 @@ from __future__ import annotations
 
 import hashlib
 import os
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numba
 
 config: Any = numba.config
+
+#: ``njit`` without numba's run time, its allocation and reference counts, for what is called in every Runge-Kutta stage.
+bare: Any = partial(numba.njit, cache=True, _nrt=False)
 
 
 def keep_by_sources() -> None:

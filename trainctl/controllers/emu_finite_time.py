@@ -35,6 +35,8 @@ import numpy as np
 from numba import njit
 from pydantic import Field
 
+from trainctl.controllers.powers import BLOCK, signed_powers
+from trainctl.kernels import bare
 from trainctl.signals import POSITION, SPEED, Floats, Ints, Links, Scene, Table, leader_at
 
 CLOCK: Literal["continuous"] = "continuous"
@@ -106,28 +108,25 @@ class Constants(NamedTuple):
     gamma2: float
     beta: float
     gamma1: float
+    terms: Floats  # (4, k) work space for the terms of one train, k >= units + links: differences [m], [m/s], and their powers
 
 
 def constants(params: Params, scene: Scene) -> Constants:
-    """Pack gains and units; nothing in it depends on who hears whom."""
+    """Pack gains and units; of who hears whom it takes the number of links only."""
     c = scene.consists
+    most = int((np.diff(c.first) + np.diff(scene.links.first)).max(initial=0))
+    terms = np.zeros((4, -(-most // BLOCK) * BLOCK))
     inertia = c.mass * c.rotating
     units = np.column_stack([c.mass, inertia, c.davis, c.length, c.stiffness / inertia])
     p = params
     return Constants(
         c.first, np.ascontiguousarray(units, dtype=np.float64), p.alpha_1, 2.0 * p.alpha_1 / (1.0 + p.alpha_1), p.p_1, p.p_2, p.p_3,
         p.p_4, p.mu_1, p.mu_2, p.coupler_stretch_m, p.coupler_compression_m, p.stretch_zone_m, p.compression_zone_m,
-        p.emergency_distance_m, p.emergency_zone_m, p.range_m, p.range_zone_m,
+        p.emergency_distance_m, p.emergency_zone_m, p.range_m, p.range_zone_m, terms,
     )  # fmt: skip
 
 
-@njit(cache=True, inline="always")
-def sig(x: float, alpha: float) -> float:
-    """sign(x) |x|**alpha."""
-    return math.copysign(math.pow(abs(x), alpha), x)
-
-
-@njit(cache=True)
+@bare(error_model="numpy")
 def coupler_weight(e: float, h1: float, h2: float, delta1: float, delta2: float) -> float:
     """Barrier weight w of a coupler at stretch ``e``: 1 inside, unbounded towards h1 and -h2."""
     if e > h1 - delta1:
@@ -139,7 +138,7 @@ def coupler_weight(e: float, h1: float, h2: float, delta1: float, delta2: float)
     return 1.0
 
 
-@njit(cache=True)
+@bare(error_model="numpy")
 def train_weight(z: float, ls: float, le: float, beta: float, gamma1: float, gamma2: float) -> float:
     """Weight b between trains at clear distance ls + ``z``: 0 out of range, unbounded towards the emergency distance."""
     zeta, beta_hat = ls - le, beta - ls
@@ -153,7 +152,7 @@ def train_weight(z: float, ls: float, le: float, beta: float, gamma1: float, gam
     return 1.0
 
 
-@njit(cache=True)
+@bare(error_model="numpy")
 def demand(
     i: int, constants: Constants, leader: Floats, age: float, slot: float, own: Floats, estimate: Floats, correction: Floats,
     desired: Floats, heard: Floats, out: Floats,
@@ -184,47 +183,56 @@ def demand(
     Notes
     -----
     The terms of a coupler are evaluated once and act on both its units. Where inertia is more than mass, inertia takes its place
-    but in the resistance.
+    but in the resistance. All powers of a train are taken together: columns of ``terms`` are those of its couplers, of its head's
+    own errors, of its links.
     """
     c, units = constants, constants.units
+    e, dv, e_power, dv_power = c.terms[0], c.terms[1], c.terms[2], c.terms[3]
     start, last = c.first[i], len(out) - 1
-    k_p1 = 1.0 / c.p1
     ahead = 0.0  # length of the units ahead in the train
+    for j in range(last):
+        row = start + j
+        e[j] = own[j, POSITION] - own[j + 1, POSITION] - units[row, LENGTH]
+        dv[j] = own[j, SPEED] - own[j + 1, SPEED]
+        ahead += units[row, LENGTH]
+    x_head, v_head = own[0, POSITION] - leader[0], own[0, SPEED] - leader[1]
+    x_tail, v_tail = own[last, POSITION] + ahead - leader[0], own[last, SPEED] - leader[1]
+    e[last], dv[last] = x_head - slot, v_head
+    for k in range(len(desired)):
+        z = last + 1 + k
+        if desired[k] > 0.0:  # the tail of the train ahead
+            e[z], dv[z] = heard[k, TAIL] - x_head - desired[k], heard[k, TAIL_SPEED] - v_head
+        else:  # the head of the train behind
+            e[z], dv[z] = x_tail - heard[k, HEAD] + desired[k], v_tail - heard[k, HEAD_SPEED]
+    signed_powers(e, c.alpha1, e_power)
+    signed_powers(dv, c.alpha2, dv_power)
     for j in range(last + 1):
         row = start + j
         v = own[j, SPEED]
         drag = units[row, C0] + (units[row, C1] + units[row, C2] * v) * v if v > 0.0 else 0.0
         out[j] = units[row, MASS] * drag
-        if j < last:
-            ahead += units[row, LENGTH]
+    k_p1 = 1.0 / c.p1
     for j in range(last):
         row = start + j
-        e = own[j, POSITION] - own[j + 1, POSITION] - units[row, LENGTH]
-        weight = coupler_weight(e, c.h1, c.h2, c.delta1, c.delta2) - k_p1 * units[row, K_HAT]
-        pull = units[row, INERTIA] * weight * (c.p1 * sig(e, c.alpha1) + c.p3 * sig(own[j, SPEED] - own[j + 1, SPEED], c.alpha2))
+        weight = coupler_weight(e[j], c.h1, c.h2, c.delta1, c.delta2) - k_p1 * units[row, K_HAT]
+        pull = units[row, INERTIA] * weight * (c.p1 * e_power[j] + c.p3 * dv_power[j])
         out[j] -= pull
         out[j + 1] += pull
-    x_head, v_head = own[0, POSITION] - leader[0], own[0, SPEED] - leader[1]
-    x_tail, v_tail = own[last, POSITION] + ahead - leader[0], own[last, SPEED] - leader[1]
-    a_head = -(c.mu1 * sig(x_head - slot, c.alpha1) + c.mu2 * sig(v_head, c.alpha2))
+    a_head = -(c.mu1 * e_power[last] + c.mu2 * dv_power[last])
     a_tail = 0.0
     for k in range(len(desired)):
-        if desired[k] > 0.0:  # the tail of the train ahead
-            z = heard[k, TAIL] - x_head - desired[k]
-            b = train_weight(z, desired[k] - heard[k, LENGTH_OF_TRAIN], c.le, c.beta, c.gamma1, c.gamma2)
-            if b > 0.0:
-                a_head += b * (c.p2 * sig(z, c.alpha1) + c.p4 * sig(heard[k, TAIL_SPEED] - v_head, c.alpha2))
-        else:  # the head of the train behind
-            z = x_tail - heard[k, HEAD] + desired[k]
+        z = last + 1 + k
+        if desired[k] > 0.0:
+            ls = desired[k] - heard[k, LENGTH_OF_TRAIN]
+            a_head += train_weight(e[z], ls, c.le, c.beta, c.gamma1, c.gamma2) * (c.p2 * e_power[z] + c.p4 * dv_power[z])
+        else:
             ls = -desired[k] - ahead - units[start + last, LENGTH]
-            b = train_weight(z, ls, c.le, c.beta, c.gamma1, c.gamma2)
-            if b > 0.0:
-                a_tail += b * (c.p4 * sig(heard[k, HEAD_SPEED] - v_tail, c.alpha2) - c.p2 * sig(z, c.alpha1))
+            a_tail -= train_weight(e[z], ls, c.le, c.beta, c.gamma1, c.gamma2) * (c.p2 * e_power[z] + c.p4 * dv_power[z])
     out[0] += units[start, INERTIA] * a_head
     out[last] += units[start + last, INERTIA] * a_tail
 
 
-@njit(cache=True)
+@bare(error_model="numpy")
 def message(
     i: int, constants: Constants, leader: Floats, slot: float, own: Floats, estimate: Floats, estimate_rate: Floats, out: Floats
 ) -> None:
@@ -240,7 +248,7 @@ def message(
     out[LENGTH_OF_TRAIN] = ahead + constants.units[start + last, LENGTH]
 
 
-@njit(cache=True)
+@bare(error_model="numpy")
 def watch(i: int, constants: Constants, leader: Floats, first: Ints, own: Floats, links: Links, out: Floats) -> None:
     """Write the clear distance to the train ahead [m], eq. (9), into ``out`` (1,): NaN if train ``i`` hears none."""
     out[0] = np.nan
