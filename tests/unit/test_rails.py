@@ -504,6 +504,40 @@ def test_every_mistake_is_named_at_once(convert):
         Rails.read(net)
 
 
+def test_an_internal_edge_belongs_to_one_connection(convert):
+    net = convert(DIAMOND, DIAMOND_EDGES, "wc>ce sc>cn")
+    net.write_text(net.read_text().replace('via=":c_1_0"', 'via=":c_0_0"'))
+    with pytest.raises(LineError, match="edge :c_0: lies on 2 connections between different edges"):
+        Rails.read(net)
+
+
+def test_whatever_is_broken_in_a_net_it_is_read_or_refused_in_words(convert):
+    whole_words = convert(DIAMOND, DIAMOND_EDGES, "wc>ce sc>cn").read_text()
+    net = convert(DIAMOND, DIAMOND_EDGES)
+    rng = np.random.default_rng(5)
+    values = ["", "x", "-1", "nan", "1e400", "0", "0,0", "rail", ":c_0", ":c_0_0", "internal", "wc", "1"]
+    outcome = {True: 0, False: 0}
+    for _ in range(400):
+        words = whole_words
+        for _ in range(rng.integers(1, 6)):
+            spots = list(re.finditer(r' \w+="([^"]*)"', words))
+            spot = spots[rng.integers(len(spots))]
+            if rng.random() < 0.4:
+                words = words[: spot.start()] + words[spot.end() :]
+            else:
+                words = words[: spot.start(1)] + values[rng.integers(len(values))] + words[spot.end(1) :]
+        net.write_text(words)
+        try:
+            rails = Rails.read(net)
+            assert len(rails.start_m) == len(rails.edges) == len(rails.onward)
+            assert rails.chains.keys() >= rails.reversal
+            outcome[True] += 1
+        except LineError as error:
+            assert error.mistakes
+            outcome[False] += 1
+    assert min(outcome.values()) > 40
+
+
 def test_the_kilometrage_runs_on_wherever_one_exists():
     """Any graph whose lengths come from places on a line has it, and every part of it begins at 0."""
     rng = np.random.default_rng(4)
