@@ -78,8 +78,14 @@ _ROUTED = {
 }  # fmt: skip
 _ROUTE = {"id", "edges", "probability", "repeat", "cycleTime", "refId"}
 _STOP = {"lane", "edge", "startPos", "endPos", "friendlyPos", "duration", "until", *_PLACES}
+#: What SUMO takes in place of a number; the first is its default for rail vehicles.
+_WORDS = {
+    "departPos": ("base", "stop", "random", "free", "random_free", "last", "splitFront"),
+    "departSpeed": ("max", "desired", "speedLimit", "last", "avg", "random"),
+    "arrivalPos": ("max", "random", "center"),
+}
 #: What a stop may say that changes nothing here.
-_SILENT = {"line", "tripId", "actType", "color", "name", "arrival", "started", "ended", "posLat", "index", "lane", "parking"}
+_SILENT = {"line", "tripId", "actType", "color", "name", "arrival", "started", "ended", "posLat", "index", "parking"}
 
 
 #: What a vType must say to be a plant of ours, in SUMO's units: kg, kW, kN, and kN with m/s.
@@ -183,10 +189,10 @@ def read_traffic(sumocfg: Path, work: Path, end_s: float | None = None, seed: in
     wrong += [f"{sumocfg}: {path}: no such file" for path in (*net, *routes, *more) if not path.is_file()]
     times = {}
     for key, missing in (("begin", "0"), ("end", "-1"), ("step-length", "1")):
-        try:
-            times[key] = _seconds(options.get(key, missing))
-        except ValueError:
-            wrong.append(f"{sumocfg}: {key} = {options[key]}: must be a time")
+        said = options.get(key, missing)
+        times[key] = _seconds(said) if _is_time(said) else math.nan
+        if not (times[key] > 0 if key == "step-length" else math.isfinite(times[key])):
+            wrong.append(f"{sumocfg}: {key} = {said}: must be a time{', above 0' if key == 'step-length' else ''}")
     if wrong:
         raise InputError(wrong)
     begin, own_end = times["begin"], times["end"] if times["end"] >= 0 else None
@@ -687,6 +693,7 @@ def _told(words: str, tags: dict[str, str]) -> list[str]:
 
 
 def _departure(vehicle: Element, source: Element, kind: Kind, demand: _Demand, tracks: _Tracks) -> tuple[Departure, list[str]]:
+    """A train out of what duarouter wrote and what the file said, and the mistakes in it."""
     name, route = vehicle.get("id", ""), vehicle.find("route")
     edges = () if route is None else tuple(route.get("edges", "").split())
     places = [_place(stop, demand, tracks) for stop in vehicle.iter("stop")]
@@ -715,14 +722,9 @@ def _departure(vehicle: Element, source: Element, kind: Kind, demand: _Demand, t
     if wrong:
         return departure, wrong
     first, last = (tracks.length[f"{e}_0"] for e in (edges[0], edges[-1]))
-    words = {
-        "departPos": ("base", "stop", "random", "free", "random_free", "last", "splitFront"),
-        "departSpeed": ("max", "desired", "speedLimit", "last", "avg", "random"),
-        "arrivalPos": ("max", "random", "center"),
-    }
     wrong = [
         f"train {name}: {key} = {source.get(key)}: must be a number or one of {', '.join(known)}"
-        for key, known in words.items()
+        for key, known in _WORDS.items()
         if source.get(key, known[0]) not in known and not _is_number(source.get(key, ""))
     ]
     if source.get("departSpeed", "0").startswith("-"):
@@ -749,7 +751,7 @@ def _depart_position(said: str, length: float, first: float, departure: Departur
     stop = departure.stops[0] if departure.stops and departure.stops[0].edge == departure.edges[0] else None
     if said == "stop" and stop is not None:
         return stop.position_m
-    if said in ("base", "stop", "random", "free", "random_free", "last", "splitFront"):
+    if said in _WORDS["departPos"]:
         # SUMO puts the rear a bit behind the beginning of the edge, but no farther than the first stop.
         base = min(length + 0.1, first)
         return base if stop is None else min(base, stop.position_m)

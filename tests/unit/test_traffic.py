@@ -331,12 +331,19 @@ def test_files_that_are_not_what_they_should_be(files: Files) -> None:
     (files.folder / "bad.rou.xml.gz").write_bytes(b"\x1f\x8bnothing of the kind")
     assert told("not XML")[0].startswith("F/run.sumocfg: not XML: ")
     assert told("<net/>") == ["F/run.sumocfg: not a SUMO configuration: it begins with <net>, not <sumoConfiguration>"]
+    (files.folder / "other.net.xml").write_text("<nodes/>")
+    assert told('<configuration><net-file value="other.net.xml"/><route-files value="list.xml"/></configuration>') == [
+        "F/other.net.xml: not a SUMO net: its root element is <nodes>, not <net>"
+    ]
     assert told("<configuration/>") == ["F/run.sumocfg: no net-file", "F/run.sumocfg: no route-files"]
     assert told(f'<configuration>{net}<route-files value="a.xml,b.xml"/><end value="soon"/></configuration>') == [
         "F/run.sumocfg: F/a.xml: no such file",
         "F/run.sumocfg: F/b.xml: no such file",
         "F/run.sumocfg: end = soon: must be a time",
     ]
+    assert told(
+        '<configuration><net-file value="list.xml"/><route-files value="list.xml"/><step-length value="0"/></configuration>'
+    ) == ["F/run.sumocfg: step-length = 0: must be a time, above 0"]
     assert told(f'<configuration>{net}<route-files value="list.xml"/></configuration>')[0].startswith("F/list.xml: not XML: ")
     assert told(f'<configuration>{net}<route-files value="bad.rou.xml.gz"/></configuration>')[0].startswith(
         "F/bad.rou.xml.gz: not XML"
