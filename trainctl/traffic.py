@@ -78,7 +78,7 @@ _ROUTED = {
 }  # fmt: skip
 _ROUTE = {"id", "edges", "probability", "repeat", "cycleTime", "refId"}
 _STOP = {"lane", "edge", "startPos", "endPos", "friendlyPos", "duration", "until", *_PLACES}
-#: What SUMO takes in place of a number; the first is its default for rail vehicles.
+#: What SUMO takes in place of a number; the first is its default.
 _WORDS = {
     "departPos": ("base", "stop", "random", "free", "random_free", "last", "splitFront"),
     "departSpeed": ("max", "desired", "speedLimit", "last", "avg", "random"),
@@ -736,7 +736,7 @@ def _departure(vehicle: Element, source: Element, kind: Kind, demand: _Demand, t
     arrival_m = last / 2 if arrival == "center" else None
     if _is_number(arrival):
         arrival_m = min(max(float(arrival) + (last if float(arrival) < 0 else 0.0), 0.0), last)  # as in SUMO
-    # Without a word of it SUMO lets rail vehicles, and no others, begin as fast as they may.
+    # Without a word of it SUMO lets a train begin as fast as it may (measured; its documentation says 0).
     speed = source.get("departSpeed", "max")
     speed_mps = float(speed) if _is_number(speed) else None
     if not 0.0 <= position <= first:
