@@ -396,6 +396,21 @@ def test_a_line_of_ours_is_the_same_computed_and_read(tmp_path, name):
         assert way.tolist() == [line.index[e] for e in line.route_over(line.edges[before], c.id)]
 
 
+def test_a_line_of_ours_rebuilt_with_internal_edges_is_a_net_like_any(tmp_path):
+    spec = parse_spec(HILLY, "")
+    build(spec, tmp_path)
+    program, environment = netconvert()
+    files = [word for option, kind in (("-n", "nod"), ("-e", "edg"), ("-x", "con")) for word in (option, f"hilly.{kind}.xml")]
+    command = [str(program), *files, "-o", "other.net.xml"]
+    subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True)
+    rails, line = Rails.read(tmp_path / "other.net.xml"), Line.of(spec)
+    whole(rails)
+    assert rails.internal.any()
+    route = line.route_over("left_250.5", "over")
+    assert names(rails, [k for k in rails.way(route) if not rails.internal[k]]) == list(route)
+    agrees(rails, tmp_path / "other.net.xml", list(route))
+
+
 def test_the_railway_that_comes_with_sumo():
     rails = Rails.read(wheel_net())
     whole(rails)
@@ -509,6 +524,14 @@ def test_an_internal_edge_belongs_to_one_connection(convert):
     net.write_text(net.read_text().replace('via=":c_1_0"', 'via=":c_0_0"'))
     with pytest.raises(LineError, match="edge :c_0: lies on 2 connections between different edges"):
         Rails.read(net)
+
+
+def test_a_chain_that_bites_its_tail_ends(convert):
+    net = convert(DIAMOND, DIAMOND_EDGES, "wc>ce sc>cn")
+    words = net.read_text()
+    net.write_text(words.replace('<connection from=":c_0" ', '<connection from=":c_0" via=":c_0_0" '))
+    assert net.read_text() != words
+    assert Rails.read(net).chains == {(3, 0): (5,), (2, 1): (4,)}
 
 
 def test_whatever_is_broken_in_a_net_it_is_read_or_refused_in_words(convert):
