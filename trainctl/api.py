@@ -21,10 +21,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from pydantic import ValidationError
 
 from trainctl import runner
 from trainctl.errors import InputError
 from trainctl.prepare import open_scenario
+from trainctl.reading import mistakes
 from trainctl.record import run as recorded
 from trainctl.runner import Backend
 from trainctl.scenario import Event
@@ -285,30 +287,46 @@ class Simulation:
         """Give trains back to the law, from its next control instant on; without names, all."""
         self._loop.outside[[self._number(t) for t in trains] if trains else slice(None)] = np.nan
 
-    def reroute(self, train: str, *, to_track: str | None = None, crossover: str | None = None) -> None:
-        """Order a train onto another track: over the next crossover to it, or over one named.
+    def reroute(
+        self,
+        train: str,
+        *,
+        to_track: str | None = None,
+        crossover: str | None = None,
+        to_edge: str | None = None,
+        position_m: float | None = None,
+        gap_below_m: float | None = None,
+        speed_below_mps: float | None = None,
+    ) -> None:
+        """Order a train onto another track, over the next crossover to it or over one named, or to an edge of the net.
+
+        The order is followed at once, or where its front passes ``position_m``, or as soon as the gap to the train ahead or its
+        speed is below a value. One that cannot be followed is told as the event ``reroute_refused``, with the reason.
 
         Raises
         ------
         InputError
-            There is no such crossover ahead on the train's track.
+            There is no such train, track, crossover or edge.
         """
-        i, line = self._number(train), self._loop.p.line
-        if (to_track is None) == (crossover is None):
-            raise InputError("reroute: give either to_track or crossover")
-        seen = self._loop.world.measure()
-        edge, position = int(seen.edge[i]), float(seen.position[i])
+        loop, line = self._loop, self._loop.p.line
+        self._number(train)
+        wrong = []
+        if to_track is not None and str(to_track) not in line.track_ids:
+            wrong.append(f"reroute: to_track = {to_track}: no such track; there are: {', '.join(line.track_ids)}")
+        if crossover is not None and crossover not in line.crossover:
+            wrong.append(f"reroute: crossover = {crossover}: no such crossover")
+        if to_edge is not None and to_edge not in line.index:
+            wrong.append(f"reroute: to_edge = {to_edge}: no such edge")
+        if wrong:
+            raise InputError(wrong)
         try:
-            if to_track is not None:
-                ahead = line.next_crossover(line.tracks[edge], position, str(to_track))
-                if ahead is None:
-                    raise ValueError(f"no crossover from track {line.tracks[edge]} to {to_track} ahead of {position:.1f} m")
-                crossover = ahead.id
-            line.route_over(line.edges[edge], str(crossover))
-        except ValueError as error:
-            raise InputError(f"reroute of train {train}: {error}") from None
-        event = Event(kind="reroute", train=str(train), crossover=str(crossover), time_s=self.time)
-        self._loop.pending.insert(0, (len(self._loop.p.scenario.event) + 1, event))
+            event = Event(
+                kind="reroute", train=str(train), crossover=crossover, to_track=None if to_track is None else str(to_track),
+                to_edge=to_edge, time_s=self.time, position_m=position_m, gap_below_m=gap_below_m, speed_below_mps=speed_below_mps,
+            )  # fmt: skip
+        except ValidationError as error:
+            raise InputError([f"reroute: {line}" for line in mistakes(error, {}, "", Event)]) from None
+        loop.reroutes.add(event)
 
     def close(self) -> Run | None:
         """End the simulation; the run folder, if ``out`` was given."""

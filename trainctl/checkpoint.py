@@ -276,7 +276,8 @@ def state(simulation: Simulation) -> tuple[dict[str, Any], dict[str, Any]]:
     t, own, links = s.relinked
     seen = s.world.measure()
     values: dict[str, Any] = {
-        "k": s.k, "pending": len(s.pending), "relinked_s": t, "sent": len(s.exchange.sent), "alarms": s.alarms.values(),
+        "k": s.k, "pending": [number for number, _ in s.reroutes.pending], "relinked_s": t, "sent": len(s.exchange.sent),
+        "alarms": s.alarms.values(),
     }  # fmt: skip
     arrays: dict[str, Any] = {
         "own": s.own, "track": s.track, "formation": s.formation, "ahead": s.ahead, "links": s.links, "demand": s.demand,
@@ -304,7 +305,7 @@ def restore(simulation: Simulation, tape: Tape, saved: Saved) -> None:
         return kind(*(arrays[f"{part}.{k}"].copy() for k in range(len(kind._fields))))
 
     s.k, s.own, s.track, s.formation = values["k"], arrays["own"].copy(), arrays["track"].copy(), arrays["formation"].copy()
-    s.pending = s.pending[len(s.pending) - values["pending"] :]
+    s.reroutes.pending = [one for one in s.reroutes.pending if one[0] in values["pending"]]
     s.links, s.ahead, s.demand = taken(Links, "links"), arrays["ahead"].copy(), taken(Demand, "demand")
     relinked = values["relinked_s"], arrays["relinked_own"].copy(), taken(Links, "relinked_links")
     s.relinked = relinked

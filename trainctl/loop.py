@@ -11,18 +11,25 @@ from typing import Any
 
 import numpy as np
 
-from trainctl.errors import InputError, LawError
+from trainctl.errors import LawError
+from trainctl.lookout import View
 from trainctl.monitors import bounds as monitor
 from trainctl.motion import Motion, Points, Units
 from trainctl.plants import disturbance
 from trainctl.plants.integrate import Extremes
 from trainctl.prepare import Prepared
+from trainctl.railway import Lookout, Service, Supervision
 from trainctl.record.journal import Journal, Row
-from trainctl.scenario import Event
+from trainctl.reroute import Reroutes
 from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Ints, Links, Trains
-from trainctl.topology import graph
+from trainctl.supervisor import applied
+from trainctl.topology import convoys, graph
 from trainctl.topology.exchange import Exchange
-from trainctl.world import Seen, Start, World
+from trainctl.topology.ways import Ways
+from trainctl.world import Seen, Start, World, lay_out
+
+#: Slower than this is a stand [m/s].
+STANDS = 1e-9
 
 
 class Simulation:
@@ -45,6 +52,8 @@ class Simulation:
         Track every train is on, as index into ``line.track_ids``.
     formation : ndarray, shape (n,)
         Track of the formation every train belongs to; a train whose join is delayed stands outside of all (-1 - its index).
+    service : Service or None
+        Trains that come and go, where they do.
     relinked : tuple or None
         Time, ``own`` and links at the last change of topology: what the constants were made of.
     between : callable or None
@@ -62,7 +71,10 @@ class Simulation:
         self.formation = self.track.copy()
         self.links: Links | None = None
         self.ahead: Ints = np.full(n, -1)
-        self.pending = sorted(enumerate(prepared.scenario.event, 1), key=lambda e: e[1].time_s)
+        self.lookout = None if prepared.supervision.mode == "off" and prepared.roster is None else Lookout(prepared)
+        self.service = None if prepared.roster is None else Service(prepared)
+        self.supervision = Supervision(prepared)
+        self.reroutes = Reroutes(prepared)
         self.signals = disturbance.prepare(
             prepared.scenario.disturbance, prepared.scenario.ids, run.step_s, run.seed, prepared.worst
         )
@@ -85,16 +97,21 @@ class Simulation:
         """One simulator step of the closed loop."""
         t = self.time
         seen = self._measure()
-        self._order_reroutes(t, seen)
-        self._topology(t, seen)
+        view = self._traffic(t, seen)
+        self._topology(t, seen, view)
         disturbed = disturbance.at(self.signals, self.k, t, seen.position)
         if self.p.sampled and self.k % self.p.scenario.run.held_steps == 0:
             self.demand = self._protect(self._control(t, disturbed))
         self.demand = self._from_outside(self.demand)
         before, past = self.own, self._past()
-        self.own, motion = self.motion.advance(self.k, t, before, self.demand, self.links, self.exchange, disturbed)
+        self.own, motion = self._supervised(t, seen, view, before, disturbed)
         self._check(t, motion)
         self._record(t, seen, before, motion, past, disturbed)
+        if view is not None:
+            for alarm in self.alarms.overlaps(t, np.where(seen.present, view.room, np.inf), view.body):
+                self.journal.event(t, "violation", **alarm)
+        if self.service is not None:
+            self.service.advance()
         self.world.move(motion.displacement, self.p.scenario.run.step_s)
         self.k += 1
         if self.between is not None:
@@ -113,63 +130,94 @@ class Simulation:
     def end(self) -> None:
         """Record the last state, which nothing acts on."""
         seen = self._measure()
-        self._topology(self.time, seen)
+        if self.service is None:
+            self._topology(self.time, seen, None)
         self._record(self.time, seen, self.own, None, self._past(), None)
 
     def _start(self) -> None:
-        p, line = self.p, self.p.line
-        first = p.consists.first
-        places = [line.locate(t.track, t.position_m) for t in p.scenario.train]
-        self.world.start(
-            Start(
-                ids=p.scenario.ids,
-                edge=np.array([e for e, _ in places], np.int64),
-                lane_position=np.array([x for _, x in places]),
-                speed=self.own[p.heads, SPEED],
-                length=p.consists.train_length(),
-                unit_length=[p.consists.length[a:b] for a, b in pairwise(first)],
-                routes=[line.route(t.track, t.position_m) for t in p.scenario.train],
-                present=np.ones(len(places), bool),
-                vclass=["rail"] * len(places),
-            )
+        p, line, roster = self.p, self.p.line, self.p.roster
+        ids, first, speed = p.scenario.ids, p.consists.first, self.own[p.heads, SPEED]
+        places = [line.locate(t.track, t.position_m) for t in p.scenario.train] if roster is None else []
+        start = Start(
+            ids=ids,
+            edge=np.array([e for e, _ in places], np.int64) if roster is None else roster.edge,
+            lane_position=np.array([x for _, x in places]) if roster is None else roster.lane_position,
+            speed=speed.copy(),
+            length=p.consists.train_length(),
+            unit_length=[p.consists.length[a:b] for a, b in pairwise(first)],
+            routes=[line.route(t.track, t.position_m) for t in p.scenario.train] if roster is None else roster.routes,
+            present=np.full(len(ids), roster is None),
+            vclass=["rail"] * len(ids) if roster is None else roster.vclass,
         )
+        if self.service is not None:
+            ways = lay_out(line, start)
+            row = ways.first[:-1]
+            nobody = Seen(ways.begin[row] + start.lane_position, ways.edge[row], row, start.present)
+            for i, v in self._entering(0.0, ways, nobody):
+                start.present[i], start.speed[i] = True, v
+        self.world.start(start)
 
     def _measure(self) -> Seen:
         """SUMO owns where a train is: shift every train, as a whole, onto its measured front."""
         seen = self.world.measure()
+        if self.service is not None:
+            seen = seen._replace(position=seen.position + self.service.offset)
         shift = seen.position - self.own[self.p.heads, POSITION]
         self.own[:, POSITION] += np.repeat(shift, np.diff(self.p.consists.first))
         return seen
 
-    def _order_reroutes(self, t: float, seen: Seen) -> None:
-        """Give trains their new routes when their time has come."""
-        while self.pending and self.pending[0][1].time_s <= t + 1e-9:
-            number, event = self.pending.pop(0)
-            self._reroute(t, number, event, seen)
+    def _traffic(self, t: float, seen: Seen) -> View | None:
+        """New routes, trains that come, leave and stop; returns what is ahead of every train, where anybody asks."""
+        speed = self.own[self.p.heads, SPEED]
+        for i, edges in self.reroutes.orders(t, self.world.measure(), self.world.ways, speed, self.ahead, self.journal):
+            self.world.route(i, edges)
+        if self.lookout is None:
+            return None
+        here, ways = self.world.measure(), self.world.ways
+        if self.service is None:
+            held = self.lookout.claim(t, ways, here, speed, self.journal, ~here.present)
+            return self.lookout.look(ways, here, speed, held)
+        self.service.arrivals(t, here.present, self.journal)
+        self.stops = self.service.stops(t, here, speed, self.journal)
+        present = here.present.copy()
+        for i, v in self._entering(t, ways, here):
+            self.world.insert(i, v)
+            present[i] = True
+        return self.lookout.look(ways, here._replace(present=present), self.own[self.p.heads, SPEED], self.held)
 
-    def _reroute(self, t: float, number: int, event: Event, seen: Seen) -> None:
-        i, line = self.p.scenario.ids.index(event.train), self.p.line
-        edge, position = int(seen.edge[i]), float(seen.position[i])
-        where = f"train {event.train} is at {position:.3f} m on track {line.tracks[edge]} at {t:g} s"
-        try:
-            if event.crossover is None:
-                ahead = line.next_crossover(line.tracks[edge], position, str(event.to_track))
-                if ahead is None:
-                    raise ValueError(f"no crossover to track {event.to_track} ahead")
-            else:
-                ahead = line.crossover[event.crossover]
-            edges = line.route_over(line.edges[edge], ahead.id)
-        except ValueError as error:
-            raise InputError(f"{self.p.file}: event[{number}]: {error}; {where}") from None
-        self.world.route(i, edges)
-        self.journal.event(
-            t, "reroute", train=event.train, crossover=ahead.id, from_track=ahead.from_track, to_track=ahead.to_track,
-            switch_m=ahead.start_m,
-        )  # fmt: skip
+    def _entering(self, t: float, ways: Ways, here: Seen) -> list[tuple[int, float]]:
+        """Trains whose time has come and whose place is clear, with the speed they come with [m/s]."""
+        assert self.service is not None and self.lookout is not None
+        due, speed = self.service.due(t), self.own[self.p.heads, SPEED]
+        asking = np.zeros(len(speed), bool)
+        asking[due] = True
+        self.held = self.lookout.claim(t, ways, here, speed, self.journal, asking)
+        come, present = [], here.present.copy()
+        for i in due:
+            if self.held.room[i] <= 0.0:
+                continue
+            present[i] = True
+            view = self.lookout.look(ways, here._replace(present=present), speed, self.held)
+            v = self.service.entering_speed(i, speed, view)
+            present[i] = v is not None
+            if v is not None:
+                self.service.enters(i, t, v, self.journal)
+                self.own[self.p.consists.first[i] : self.p.consists.first[i + 1], SPEED] = v
+                speed[i] = v
+                come.append((i, v))
+        return come
 
-    def _topology(self, t: float, seen: Seen) -> None:
-        """Who hears whom; made anew only when a track or the order changed."""
+    def _topology(self, t: float, seen: Seen, view: View | None) -> None:
+        """Who hears whom; made anew only when a track, the order or a coupling changed."""
         track = self.line_track[seen.edge]
+        if self.service is not None and view is not None:
+            self.track = track
+            if self.service.couple(t, seen, self.own, view, self.journal) or self.links is None:
+                links = self.service.links()
+                self.formation = convoys.fronts(self.service.ahead)
+                self._relink(t, links)
+            seen.position[:] = self.own[self.p.heads, POSITION]
+            return
         moved = np.flatnonzero(track != self.track)
         for i in moved.tolist():
             self.journal.event(t, "leave", train=self.p.scenario.ids[i], track=self.p.line.track_ids[self.track[i]])
@@ -229,6 +277,7 @@ class Simulation:
         self.ahead = np.full(len(rank), -1)
         behind = links.order[1:][self.formation[links.order[1:]] == self.formation[links.order[:-1]]]
         self.ahead[behind] = links.order[rank[behind] - 1]
+        check = before is not None and self.service is None  # the service has asked before it coupled
         self.world.linked(links, self.formation)
         groups = graph.components(len(rank), links.sender, links.receiver)
         self.journal.event(
@@ -236,7 +285,7 @@ class Simulation:
             "topology",
             edges=graph.edges(links, p.scenario.ids),
             formations=[[p.scenario.ids[i] for i in sorted(group)] for group in groups],
-            start_condition=[] if before is None else p.law.violations(p.params, scene),
+            start_condition=p.law.violations(p.params, scene) if check else [],
         )
         for alarm in self.alarms.relinked(t, groups, self.formation, scene):
             self.journal.event(t, "violation", **alarm)
@@ -244,7 +293,8 @@ class Simulation:
     def _control(self, t: float, disturbed: disturbance.Disturbed) -> Demand:
         """Exchange messages and evaluate the sampled law."""
         assert self.links is not None
-        law, leader = self.p.law, self.p.leader(t)
+        law = self.p.law
+        leader = self.p.leader(t) if self.service is None else self.service.leader()
         heads = self.own[self.p.heads]
         own = Trains(
             position=heads[:, POSITION] + disturbed.measurement,
@@ -280,6 +330,55 @@ class Simulation:
         given = np.clip(given, (bounds.speed_lower - speed) / period, (bounds.speed_upper - speed) / period)
         return Demand(given, demand.saturated | (given != asked))
 
+    def _supervised(
+        self, t: float, seen: Seen, view: View | None, own: Floats, disturbed: disturbance.Disturbed
+    ) -> tuple[Floats, Motion]:
+        """The plant over one step: as the law demands, or the driver of a train alone, within what the supervisor allows."""
+        free = np.full(len(seen.position), np.nan)
+        speed = own[self.p.heads, SPEED]
+        if view is None:
+            return self._advance(t, own, free, disturbed)
+        raw = self.world.measure()
+        stands = ~raw.present
+        ordered = free
+        if self.service is not None:
+            ordered = self.service.drive(raw, speed, view, self.stops)
+            stands = stands | self.service.standing
+        if self.supervision.rules.mode == "off":
+            return self._advance(t, own, ordered, disturbed, stands)
+        verdict = self.supervision.verdict(view, speed)
+        trial = self.motion.saved(), self.exchange.copy()
+        moved, motion = self._advance(t, own, ordered, disturbed, stands)
+        within, acts = applied(verdict, motion.acceleration)
+        acts &= ~stands
+        if self.supervision.rules.mode == "on" and acts.any():
+            self.motion.restore(trial[0])
+            self.exchange = trial[1]
+            ordered = np.where(acts, within, ordered)
+            moved, motion = self._advance(t, own, ordered, disturbed, stands)
+        self.supervision.tell(self.journal, t, verdict, acts, view, speed)
+        return moved, motion
+
+    def _advance(
+        self, t: float, own: Floats, ordered: Floats, disturbed: disturbance.Disturbed, stands: Bools | None = None
+    ) -> tuple[Floats, Motion]:
+        """The plant over one step; trains that stand, or are not there, stay as they are."""
+        pace = None if self.service is None else self.service.leader()
+        moved, motion = self.motion.advance(
+            self.k, t, own, self.demand, self.links, self.exchange, disturbed, ordered, pace
+        )
+        if stands is None:
+            return moved, motion
+        moved[np.abs(moved[:, SPEED]) < STANDS, SPEED] = 0.0  # a stand ordered is one, rounding aside
+        rows = np.repeat(stands, np.diff(self.p.consists.first))
+        moved[rows] = own[rows]
+        here = self.world.measure().present
+        moved[np.repeat(stands & here, np.diff(self.p.consists.first)), SPEED] = 0.0
+        return moved, motion._replace(
+            displacement=np.where(stands, 0.0, motion.displacement), clipped=motion.clipped & ~stands,
+            acceleration=np.where(stands, 0.0, motion.acceleration),
+        )  # fmt: skip
+
     def _check(self, t: float, motion: Motion) -> None:
         """Numbers must stay finite; a train never moves backwards; bounds that break are told once."""
         finite = np.logical_and.reduceat(np.isfinite(self.own).all(axis=1), self.p.heads)
@@ -308,6 +407,7 @@ class Simulation:
         row = Row(
             time=t, seen=seen, track=self.track, own=own, speed=heads[:, SPEED], ahead=self.ahead, links=self.links,
             motion=motion, saturated=self._saturated(motion), extremes=past, disturbed=disturbed,
+            led=None if self.service is None else self.service.led,
         )  # fmt: skip
         for alarm in self.alarms.new(row):
             self.journal.event(t, "violation", **alarm)

@@ -20,6 +20,7 @@ class Motion(NamedTuple):
 
     displacement: Floats  # (n,) m, what SUMO is told to do
     input: Floats  # (n,) m/s2, force of the whole train per mass at the beginning of the step
+    acceleration: Floats  # (n,) m/s2, mean over the step
     limited: Bools  # (n,) a limit of the plant acted
     clipped: Bools  # (n,) the train would have moved backwards
     force: Floats | None  # (U,) N at the beginning of the step
@@ -44,13 +45,22 @@ class Points:
         return point.resistance(own[:, SPEED], self.constants.davis) + point.climbing(own[:, POSITION], self.constants.gradient)
 
     def advance(
-        self, k: int, t: float, own: Floats, demand: Demand, links: Links | None, exchange: Exchange, disturbed: Disturbed
-    ) -> tuple[Floats, Motion]:
-        """One exact step of the discrete map."""
+        self, k: int, t: float, own: Floats, demand: Demand, links: Links | None, exchange: Exchange, disturbed: Disturbed,
+        ordered: Floats, pace: Floats | None,
+    ) -> tuple[Floats, Motion]:  # fmt: skip
+        """One exact step of the discrete map; ``ordered`` (n,) accelerations stand for the law's where they are not NaN."""
         constants = self.constants._replace(resistance_factor=disturbed.resistance)
         kick = point.Kick(disturbed.position, disturbed.speed, disturbed.input)
-        moved = point.advance(constants, own, demand.acceleration, self.step, kick)
-        return moved.own, Motion(moved.displacement, moved.input, moved.limited, moved.clipped, None, {})
+        asked = np.where(np.isnan(ordered), demand.acceleration, ordered)
+        moved = point.advance(constants, own, asked, self.step, kick)
+        mean = (moved.own[:, SPEED] - own[:, SPEED]) / self.step
+        return moved.own, Motion(moved.displacement, moved.input, mean, moved.limited, moved.clipped, None, {})
+
+    def saved(self) -> None:
+        """Nothing changes here from step to step."""
+
+    def restore(self, saved: None) -> None:
+        """Nothing to go back to."""
 
 
 class Units:
@@ -83,6 +93,11 @@ class Units:
         self.masses = p.consists.train_mass()
         self.extremes = self._fresh()
         self.counted = -1  # number of the last exchange
+        guided = p.roster is not None
+        ordered = guided or p.supervision.mode != "off"
+        self.orders = integrate.Orders(
+            np.full(len(p.own) if ordered and not p.sampled else 0, np.nan), np.zeros((len(self.masses) if guided else 0, 3)), 0.0
+        )
 
     def believed_resistance(self, own: Floats) -> Floats:
         """Running resistance and gradient of whole trains per mass [N/kg], shape (n,)."""
@@ -106,7 +121,7 @@ class Units:
         """Take over a new edge list; ``constants`` are the law's own (a sampled law does not run here)."""
         p = self.p
         own_law = shared.constants(p.plant_params, p.consists, self.gradient) if p.sampled else constants
-        self.loop = integrate.Loop(own_law, p.observer.constants(p.observer_params, scene), self.plant)
+        self.loop = integrate.Loop(own_law, p.observer.constants(p.observer_params, scene), self.plant, self.orders)
         messages = len(scene.links.sender), self.law.MESSAGE
         self.air = integrate.Air(np.zeros(messages), self.period is None, self.law.ORDER == "chain", 0.0)
         self.work = integrate.scratch(p.own, self.estimate, len(self.masses), p.observer.CORRECTIONS, self.law.MESSAGE)
@@ -118,13 +133,23 @@ class Units:
         )  # fmt: skip
 
     def advance(
-        self, k: int, t: float, own: Floats, demand: Demand, links: Links | None, exchange: Exchange, disturbed: Disturbed
-    ) -> tuple[Floats, Motion]:
-        """Integrate over one simulator step; the displacement is that of the heads."""
+        self, k: int, t: float, own: Floats, demand: Demand, links: Links | None, exchange: Exchange, disturbed: Disturbed,
+        ordered: Floats, pace: Floats | None,
+    ) -> tuple[Floats, Motion]:  # fmt: skip
+        """Integrate over one simulator step; the displacement is that of the heads.
+
+        Trains with an ``ordered`` (n,) acceleration, not NaN, get the forces for it instead of the law's. ``pace`` (4, n) is where
+        each train's own reference is now, where they have one.
+        """
         assert links is not None
         p, first, heads = self.p, self.p.consists.first, self.p.heads
         if p.sampled:
-            self.loop.law.acceleration[:] = demand.acceleration
+            self.loop.law.acceleration[:] = np.where(np.isnan(ordered), demand.acceleration, ordered)
+        elif len(self.orders.force):
+            self.orders.force[:] = self._forces(own, np.repeat(ordered, np.diff(first)))
+        if pace is not None and len(self.orders.pace):
+            self.orders.pace[:] = pace[:3].T
+            self.loop = self.loop._replace(orders=self.orders._replace(since=t))
         self._disturb(disturbed)
         moved = own.copy()
         moved[:, SPEED] += np.repeat(disturbed.speed, np.diff(first))
@@ -148,8 +173,29 @@ class Units:
         moved[:, POSITION] += shift
         return moved, Motion(
             displacement=displacement, input=np.add.reduceat(force, heads) / self.masses,
+            acceleration=(moved[heads, SPEED] - own[heads, SPEED]) / self.step,
             limited=self.extremes.limited > limited, clipped=clipped, force=force, extras=extras,
         )  # fmt: skip
+
+    def _forces(self, own: Floats, acceleration: Floats) -> Floats:
+        """Unit forces for these accelerations [N], (U,): every unit carries its own mass, resistance and weight."""
+        c, v = self.p.consists, own[:, SPEED]
+        per_mass = c.rotating * acceleration + np.where(v > 0.0, c.davis[:, 0] + (c.davis[:, 1] + c.davis[:, 2] * v) * v, 0.0)
+        if len(self.gradient):
+            where = np.maximum(np.searchsorted(self.gradient[:, 0], own[:, POSITION], side="right") - 1, 0)
+            per_mass = per_mass + GRAVITY * self.gradient[where, 1]
+        return np.asarray(c.mass * per_mass)
+
+    def saved(self) -> Any:
+        """What a step changes here, to try one."""
+        return self.estimate.copy(), integrate.Extremes(*(a.copy() for a in self.extremes)), self.counted, self.air
+
+    def restore(self, saved: Any) -> None:
+        """Go back to before a step that was tried."""
+        estimate, extremes, self.counted, self.air = saved
+        self.estimate[:] = estimate
+        for now, then in zip(self.extremes, extremes, strict=True):
+            now[:] = then
 
     def _extras(self, t: float, own: Floats, estimate: Floats, demanded: Floats) -> dict[str, Floats]:
         """What actuators, faults and observers do at ``t``, for the log."""

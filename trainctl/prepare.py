@@ -20,8 +20,8 @@ import numpy as np
 from pydantic import ValidationError
 
 import sumo_net
-from sumo_net import Line, LineError
-from trainctl import controllers, observers, prepare_line
+from sumo_net import Line, LineError, Rails
+from trainctl import controllers, observers, prepare_line, roster, supervisor
 from trainctl.errors import InputError
 from trainctl.plants import actuated_units, disturbance, point, shared
 from trainctl.reading import examine, mistakes, read
@@ -54,6 +54,20 @@ class Prepared:
     line: Any  # Line; None only while mistakes are still being gathered
     spec: Any
     net: Path | None
+    roster: roster.Roster | None = None  # trains that come and go, with network.sumocfg
+
+    @cached_property
+    def rails(self) -> Rails:
+        """The net as a graph, its edges numbered as those of the line."""
+        return Rails.of(self.line) if self.roster is None else self.roster.rails
+
+    @property
+    def supervision(self) -> supervisor.Params:
+        """How trains are protected: as the scenario says, else only where they come and go."""
+        stated = self.scenario.supervisor
+        if stated is None:
+            return supervisor.Params(mode="off" if self.roster is None else "on")
+        return stated
 
     @property
     def heads(self) -> Ints:
@@ -219,6 +233,7 @@ def prepare(scenario: Scenario, file: str, folder: Path, known: Sequence[str] = 
         All mistakes that could be found, one line each.
     """
     found = list(known)
+    trains = None
 
     def attempt(function: Any, *arguments: Any) -> Any:
         try:
@@ -235,17 +250,27 @@ def prepare(scenario: Scenario, file: str, folder: Path, known: Sequence[str] = 
     observer_params = attempt(_params, observer.Params, scenario.observer.keys(), "observer") if observer else None
     plant = importlib.import_module(f"trainctl.plants.{scenario.plant.kind}")
     plant_params = attempt(_params, plant.Params, scenario.plant.keys(), "plant")
-    network = attempt(_network, scenario, folder)
+    network: tuple[Line, Any, Path | None] | None
+    if scenario.network.sumocfg is not None:
+        enrolled = attempt(roster.enrol, scenario, folder)
+        if enrolled is None:
+            raise InputError([f"{file}: {line}" for line in found])
+        scenario, trains, net = enrolled
+        network = roster.chart(trains.rails), None, net
+    else:
+        network = attempt(_network, scenario, folder)
     plan = attempt(_plan, scenario)
-    if network is not None:
+    if network is not None and trains is None:
         found += prepare_line.on_the_line(scenario, network[0])
     if any(part is None for part in (law, params, observer, observer_params, plant_params, plan)):
         raise InputError([f"{file}: {line}" for line in found])
 
     consists = scenario.consists()
     bounds = _bounds(scenario, consists)
-    own = _initial(scenario, consists, getattr(plant, "STATES", 2))
-    track = np.unique([t.track for t in scenario.train], return_inverse=True)[1].astype(np.int64)
+    # Trains that come and go are checked as the one formation they could be.
+    placed = scenario if trains is None else _in_formation(scenario, plan)
+    own = _initial(placed, consists, getattr(plant, "STATES", 2))
+    track = np.unique([t.track for t in placed.train], return_inverse=True)[1].astype(np.int64)
     start = own[0, POSITION] - scenario.topology.first_slot_m
     if scenario.reference.follow_line:
         followed = attempt(prepare_line.followed, scenario, network and network[0], plan, consists, start)
@@ -265,15 +290,44 @@ def prepare(scenario: Scenario, file: str, folder: Path, known: Sequence[str] = 
     ]  # fmt: skip
     if network is not None:
         prepared = replace(prepared, line=network[0], spec=network[1], net=network[2])
-        if law.CLOCK != "none":  # such trains leave at the line's end
+        if trains is not None:
+            n = len(scenario.train)
+            nobody = graph.links(plan, np.arange(n), np.arange(n))  # everybody alone
+            start = _initial(scenario, consists, getattr(plant, "STATES", 2))
+            prepared = replace(prepared, own=start, first_links=nobody, roster=trains)
+        elif law.CLOCK != "none":  # such trains leave at the line's end
             found += prepare_line.long_enough(prepared)
         found += prepare_line.steep(prepared)
+        found += _can_brake(prepared)
     if found:
         # What follows from a key that is wrong already is not a mistake of its own.
         wrong = [line.partition(" = ")[0].partition(":")[0].rpartition(".")[2] for line in known]
         news = [line for line in found[len(known) :] if not any(f"{key} = " in line for key in wrong)]
         raise InputError([f"{file}: {line}" for line in dict.fromkeys([*known, *news])])
     return prepared
+
+
+def _in_formation(scenario: Scenario, plan: graph.Plan) -> Scenario:
+    """All trains on one track, every one at its slot and at the reference's speed."""
+    speed = float(scenario.reference.speed_mps or 0.0)
+    trains = tuple(
+        t.model_copy(update={"track": "", "position_m": float(slot), "speed_mps": speed})
+        for t, slot in zip(scenario.train, plan.slot, strict=True)
+    )
+    return scenario.model_copy(update={"train": trains})
+
+
+def _can_brake(p: Prepared) -> list[str]:
+    """Whether every train can do what the supervisor relies on."""
+    if p.supervision.mode == "off" or p.scenario.plant.kind == "point":
+        return []
+    fastest = np.where(np.isfinite(p.bounds.speed_upper), p.bounds.speed_upper, max(p.leader(0.0)[1], 1.0))
+    least, _ = shared.room(p.consists, np.zeros_like(fastest), fastest)
+    return [
+        f"supervisor.emergency_mps2 = {p.supervision.emergency_mps2:g}: train {t.id} can brake with {-b:.6g} m/s2 at most"
+        for t, b in zip(p.scenario.train, least, strict=True)
+        if -b < p.supervision.emergency_mps2 - 1e-9
+    ][:3]
 
 
 def _params(model: Any, keys: dict[str, Any], table: str) -> Any:

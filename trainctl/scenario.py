@@ -15,6 +15,7 @@ from trainctl.plants.disturbance import Disturbance
 from trainctl.plants.faults import Fault
 from trainctl.reference import Profile
 from trainctl.signals import Bounds, Consists, Table
+from trainctl.supervisor import Params as Supervisor
 
 SCHEMA_VERSION = 1
 
@@ -82,12 +83,30 @@ class Network(Table):
 
     line: str | None = Field(None, description="Name of a shipped line (see `trainctl net list`) or path of a line TOML.")
     net: str | None = Field(None, description="Path of a SUMO net built by `trainctl net build`.")
+    sumocfg: str | None = Field(
+        None, description="Path of a SUMO configuration with rail traffic: trains, routes and stops are taken from it."
+    )
 
     @model_validator(mode="after")
     def _one(self) -> Network:
-        if (self.line is None) == (self.net is None):
-            raise ValueError("give exactly one of line, net")
+        if sum(key is not None for key in (self.line, self.net, self.sumocfg)) != 1:
+            raise ValueError("give exactly one of line, net, sumocfg")
         return self
+
+
+class Traffic(Table):
+    """[traffic]: how trains of a SUMO configuration are driven outside of formations, and when they form one."""
+
+    cooperate: tuple[str, ...] = Field(
+        ("*",), description="Trains that join formations, by id; * stands for anything. The others are driven by themselves."
+    )
+    acceleration_mps2: Positive = Field(0.4, description="Acceleration of a train or formation that is driven [m/s2].")
+    deceleration_mps2: Positive = Field(0.5, description="Braking for limits, stops and trains ahead, positive [m/s2].")
+    below_limit_mps: NotNegative = Field(1.0, description="Driven this far below the limits, so that a law has room above [m/s].")
+    catch_up_mps: NotNegative = Field(3.0, description="At most this faster than the reference to catch up with a formation [m/s].")
+    join_range_m: Positive = Field(20000.0, description="A train farther behind does not try to catch up [m].")
+    join_band_m: Positive = Field(50.0, description="A train joins once its spacing is right within this, and in its bounds [m].")
+    join_band_mps: Positive = Field(0.5, description="... and its speed that of the formation within this [m/s].")
 
 
 class BoundsTable(Table):
@@ -238,12 +257,20 @@ class Event(Table):
         None, description="Id of the crossover (see `trainctl net show`); default: the next one to to_track."
     )
     to_track: Id | None = Field(None, description="Track to change to, if no crossover is named.")
-    time_s: NotNegative = Field(0.0, description="When the route is ordered [s]; the train changes track when it gets there.")
+    to_edge: str | None = Field(
+        None, description="Edge of the net to go to by the shortest way, from where the train goes on to its old goal if it can."
+    )
+    time_s: NotNegative = Field(
+        0.0, description="When the route is ordered at the earliest [s]; the train changes track when it gets there."
+    )
+    position_m: float | None = Field(None, description="... once its front has passed this position [m].")
+    gap_below_m: Positive | None = Field(None, description="... once its gap to the train ahead is below this [m].")
+    speed_below_mps: Positive | None = Field(None, description="... once its speed is below this [m/s].")
 
     @model_validator(mode="after")
     def _where(self) -> Event:
-        if (self.crossover is None) == (self.to_track is None):
-            raise ValueError("give exactly one of crossover, to_track")
+        if sum(key is not None for key in (self.crossover, self.to_track, self.to_edge)) != 1:
+            raise ValueError("give exactly one of crossover, to_track, to_edge")
         return self
 
 
@@ -288,8 +315,10 @@ class Scenario(Table):
     reference: Profile
     bounds: BoundsTable = BoundsTable()
     topology: Topology = Topology()
-    train_type: dict[str, TrainType]
-    train: tuple[Train, ...] = Field(min_length=1)
+    supervisor: Supervisor | None = Field(None, description="Protection; default: off, on with network.sumocfg.")
+    traffic: Traffic | None = Field(None, description="Only with network.sumocfg.")
+    train_type: dict[str, TrainType] = Field({}, description="With network.sumocfg: by the ids of its vTypes.")
+    train: tuple[Train, ...] = ()
     link: tuple[Link, ...] = ()
     event: tuple[Event, ...] = ()
     disturbance: tuple[Disturbance, ...] = ()
@@ -311,7 +340,9 @@ class Scenario(Table):
 
     def cross_references(self) -> list[str]:
         """Mistakes between tables of this file: names that do not exist, lists of the wrong length."""
-        found = []
+        found = self._of_the_network()
+        if self.network.sumocfg is not None:
+            return found
         ids, types = dict.fromkeys(self.ids), self.train_type
         for t in self.train:
             if t.type not in types:
@@ -332,6 +363,33 @@ class Scenario(Table):
         if self.plant.kind == "point":
             many = sorted({t.type for t in self.train if t.type in types and types[t.type].units > 1})
             found += [f"train_type.{name}.units = {types[name].units}: the point plant has one unit per train" for name in many]
+        return found
+
+    def _of_the_network(self) -> list[str]:
+        """Tables that do not go with where the trains come from."""
+        if self.network.sumocfg is None:
+            found = [] if self.train else ["train: missing; a scenario needs at least one [[train]], or network.sumocfg"]
+            found += [] if self.train_type else ["train_type: missing; there must be a [train_type.NAME] for the trains"]
+            if self.traffic is not None:
+                found.append("traffic: only with network.sumocfg; the trains of [[train]] are in formations from the start")
+            return found
+        found = [
+            f"{key}: not with network.sumocfg, whose {what}"
+            for key, what in (("train", "own trains run"), ("link", "formations make their links as they form"))
+            if getattr(self, key)
+        ]
+        top = self.topology
+        for key, usual in (("rule", "same_track"), ("desired", "slots"), ("first_slot_m", 0.0)):
+            if getattr(top, key) != usual:
+                value = getattr(top, key)
+                found.append(f"topology.{key} = {value}: not with network.sumocfg; neighbours are those along the routes")
+        if top.spacing_m is None:
+            found.append("topology.spacing_m: missing; trains of a SUMO configuration form up at one desired spacing")
+        if self.reference.speed_mps is None or self.reference.follow_line:
+            found.append("reference: with network.sumocfg give speed_mps, the cruising speed; limits and stops are obeyed anyway")
+        for k, entry in enumerate(self.event, 1):
+            if entry.to_edge is None:
+                found.append(f"event[{k}]: with network.sumocfg give to_edge")
         return found
 
     def consists(self) -> Consists:

@@ -153,6 +153,28 @@ class Scene(NamedTuple):
     sub_step: float  # s, of the integrator; equal to step for discrete plants
 
 
+def restrict(scene: Scene, members: Ints) -> Scene:
+    """Return the scene of one formation alone; ``members`` (k,) are its trains, nobody else hears them."""
+    new = np.full(len(scene.trains), -1)
+    new[members] = np.arange(len(members))
+    count = np.diff(scene.consists.first)
+    units = np.repeat(new, count) >= 0
+    first = np.concatenate(([0], np.cumsum(count[members])))
+    links, rows = scene.links, new[scene.links.receiver] >= 0
+    kept = {name: getattr(links, name)[rows] for name in ("desired", "lower", "upper", "weight", "heard")}
+    receiver = new[links.receiver[rows]]
+    return scene._replace(
+        trains=[scene.trains[i] for i in members.tolist()],
+        consists=type(scene.consists)(first, *(row[units] for row in scene.consists[1:])),
+        own=scene.own[units],
+        links=links._replace(
+            sender=new[links.sender[rows]], receiver=receiver, first=np.searchsorted(receiver, np.arange(len(members) + 1)),
+            slot=links.slot[members], order=new[links.order[new[links.order] >= 0]], **kept,
+        ),
+        bounds=type(scene.bounds)(*(row[members] for row in scene.bounds)),
+    )  # fmt: skip
+
+
 class SampledLaw(Protocol):
     """A train-level law evaluated once per control period: a module of this shape in ``trainctl.controllers``.
 

@@ -36,12 +36,11 @@ class Seen(NamedTuple):
 
 
 class World(Protocol):
-    """The simulator as the loop needs it.
+    """The simulator as the loop needs it."""
 
-    ``ways`` are the ways of all trains as they are now ordered.
-    """
-
-    ways: Ways
+    @property
+    def ways(self) -> Ways:
+        """The ways of all trains as they are now ordered."""
 
     def start(self, start: Start) -> None:
         """Put the trains on the line; afterwards ``measure`` gives their initial positions."""

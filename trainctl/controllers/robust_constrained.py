@@ -41,7 +41,7 @@ from scipy.sparse import csgraph
 
 from trainctl.controllers import robust_gain, robust_theory
 from trainctl.errors import InputError
-from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, Scene, Table, Trains
+from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, Scene, Table, Trains, restrict
 
 CLOCK: Literal["sampled"] = "sampled"
 
@@ -110,7 +110,7 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
     """
     n, i = len(own.speed), links.receiver
     said = heard[:, 1] > 0.0
-    error = np.where(said, heard[:, 0] - (own.position[i] - leader[0]) - links.desired, 0.0)  # p_j - p_i + d_ij
+    error = np.where(said, heard[:, 0] - (own.position - leader[0])[i] - links.desired, 0.0)  # p_j - p_i + d_ij
     u_c = -constants.h * (own.speed - leader[1]) + np.bincount(i, links.weight * error, minlength=n)
     waits = np.bincount(i[~said], minlength=n) > 0
     return Demand(acceleration=np.where(waits, np.minimum(u_c, 0.0), u_c), saturated=np.zeros(n, bool))
@@ -129,7 +129,7 @@ def violations(params: Params, scene: Scene) -> list[str]:
     found = loop_faults + _clamp_violations(scene)
     for members in robust_gain.formations(scene) if not loop_faults else []:
         if 1 < len(members) <= robust_gain.DENSE:
-            found += _unstable(gains(params, n)[members], robust_gain.restrict(scene, members))
+            found += _unstable(gains(params, n)[members], restrict(scene, members))
     return found
 
 
@@ -292,7 +292,7 @@ def analysis(params: Params, scene: Scene, disturbances: Sequence[Disturbing]) -
         value = entry.steady(scene.trains)
         changing |= value is None
         constant = constant + (0.0 if value is None else value)
-    alone = robust_gain.restrict(scene, members)
+    alone = restrict(scene, members)
     found = robust_theory.report(
         gains(params, n)[members], alone, amplitude[:, members], None if changing else constant[:, members]
     )
@@ -314,7 +314,7 @@ def worst(params: Params, scene: Scene, plus: int, minus: int, steps: int) -> Fl
     members = next(m for m in robust_gain.formations(scene) if plus in m)
     if minus not in members:
         raise InputError(f"disturbance.pair = {[scene.trains[plus], scene.trains[minus]]}: the two are not in one formation")
-    closed = robust_gain.loop(gains(params, len(scene.trains))[members], robust_gain.restrict(scene, members))
+    closed = robust_gain.loop(gains(params, len(scene.trains))[members], restrict(scene, members))
     place = {i: k for k, i in enumerate(members.tolist())}
     out = np.zeros((5, steps, len(scene.trains)))
     out[:, :, members] = robust_gain.worst_signs(closed, place[plus], place[minus], steps)

@@ -81,28 +81,6 @@ def formations(scene: Scene) -> list[Ints]:
     return [np.flatnonzero(part == k).astype(np.int64) for k in range(count)]
 
 
-def restrict(scene: Scene, members: Ints) -> Scene:
-    """Return the scene of one formation alone."""
-    new = np.full(len(scene.trains), -1)
-    new[members] = np.arange(len(members))
-    count = np.diff(scene.consists.first)
-    units = np.repeat(new, count) >= 0
-    first = np.concatenate(([0], np.cumsum(count[members])))
-    links, rows = scene.links, new[scene.links.receiver] >= 0
-    kept = {name: getattr(links, name)[rows] for name in ("desired", "lower", "upper", "weight", "heard")}
-    receiver = new[links.receiver[rows]]
-    return scene._replace(
-        trains=[scene.trains[i] for i in members.tolist()],
-        consists=type(scene.consists)(first, *(row[units] for row in scene.consists[1:])),
-        own=scene.own[units],
-        links=links._replace(
-            sender=new[links.sender[rows]], receiver=receiver, first=np.searchsorted(receiver, np.arange(len(members) + 1)),
-            slot=links.slot[members], order=new[links.order[new[links.order] >= 0]], **kept,
-        ),
-        bounds=type(scene.bounds)(*(row[members] for row in scene.bounds)),
-    )  # fmt: skip
-
-
 def potentials(n: int, links: Links) -> Floats:
     """Slots d_i that the desired spacings give along a tree of links, 0 for the first train of every part [m], shape (n,)."""
     wanted = {(int(s), int(r)): float(d) for s, r, d in zip(links.sender, links.receiver, links.desired, strict=True)}

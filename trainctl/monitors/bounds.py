@@ -80,6 +80,9 @@ class Alarms:
         bounds = getattr(self.p.law, "watched_bounds", None)
         if self.watched and bounds is not None:
             self.now = np.stack(bounds(self.p.params, scene))
+            if self.p.roster is not None:
+                alone = np.bincount(scene.links.receiver, minlength=len(formation)) == 0
+                self.now[0, alone], self.now[1, alone] = -np.inf, np.inf
         piece = np.empty(len(formation), np.int64)
         for k, group in enumerate(groups):
             piece[list(group)] = k
@@ -94,16 +97,18 @@ class Alarms:
 
     def _all(self, row: Row) -> Iterator[Alarm]:
         ids, bounds, speed = self.p.scenario.ids, self.p.bounds, row.speed
-        yield from self._per_train("speed_lower_mps", speed, bounds.speed_lower, speed < bounds.speed_lower - ROUNDING)
-        yield from self._per_train("speed_upper_mps", speed, bounds.speed_upper, speed > bounds.speed_upper + ROUNDING)
+        led = True if row.led is None else row.led
+        yield from self._per_train("speed_lower_mps", speed, bounds.speed_lower, led & (speed < bounds.speed_lower - ROUNDING))
+        yield from self._per_train("speed_upper_mps", speed, bounds.speed_upper, led & (speed > bounds.speed_upper + ROUNDING))
         if row.motion is not None:
             u = row.motion.input
-            yield from self._per_train("input_lower_mps2", u, bounds.input_lower, u < bounds.input_lower - ROUNDING)
-            yield from self._per_train("input_upper_mps2", u, bounds.input_upper, u > bounds.input_upper + ROUNDING)
+            yield from self._per_train("input_lower_mps2", u, bounds.input_lower, led & (u < bounds.input_lower - ROUNDING))
+            yield from self._per_train("input_upper_mps2", u, bounds.input_upper, led & (u > bounds.input_upper + ROUNDING))
         yield from self._couplers(row)
         yield from self._constrained(row)
         yield from self._energies(row)
-        yield from self._collisions(row)
+        if row.led is None:  # otherwise ``along`` tells, since neighbours may be on other edges
+            yield from self._collisions(row)
         links = row.links
         spacing = row.seen.position[links.sender] - row.seen.position[links.receiver]
         ahead = spacing > 0.0  # each pair once
@@ -153,6 +158,14 @@ class Alarms:
             return
         for i, share in self.energy.broken(row):
             yield from self._once("energy_balance_share", self.p.scenario.ids[i], share, self.energy.LIMIT)
+
+    def overlaps(self, time: float, room: Floats, body: Ints) -> Iterator[Alarm]:
+        """Trains inside one another: ``room`` (n,) [m] from each front to the train ``body`` (n,) ahead on its way."""
+        for i in np.flatnonzero(room < -ROUNDING).tolist():
+            for alarm in self._once("gap_m", f"{self.p.scenario.ids[body[i]]}-{self.p.scenario.ids[i]}", float(room[i]), 0.0):
+                if self.first is None:
+                    self.first = {"time_s": time, **alarm}
+                yield alarm
 
     def _collisions(self, row: Row) -> Iterator[Alarm]:
         """Trains inside one another, whatever the law: in the order of the step before, so that passing through is seen too."""

@@ -35,6 +35,7 @@ class Row(NamedTuple):
     saturated: Bools  # (n,)
     extremes: Extremes | None  # over the sub-steps since the last row
     disturbed: Disturbed | None  # what acts from this instant on
+    led: Bools | None = None  # (n,) trains the law drives; None: all
 
 
 #: A killed run loses at most what it recorded in this time [s].
@@ -58,7 +59,10 @@ class Journal:
         self.disturbances = DISTURBANCES if p.scenario.disturbance else ()
         tables = standard_tables(
             p.scenario.ids, p.line.track_ids, p.line.edges, units=self.has_units, watched=watched,
-            train_extras=(*(ENERGIES if self.has_units else ()), *self.disturbances), unit_extras=self.extras,
+            train_extras=(
+                *(ENERGIES if self.has_units else ()), *self.disturbances, *(("in_formation",) if p.roster is not None else ()),
+            ),
+            unit_extras=self.extras,
         )  # fmt: skip
         self.recorder = Recorder(folder, tables, {"scenario_sha256": p.scenario.hash()}, resume=resume)
         self.saved = time.monotonic()
@@ -76,20 +80,24 @@ class Journal:
         if time.monotonic() - self.saved > SAVE_EVERY_S:
             self.recorder.cut()
             self.saved = time.monotonic()
-        n = len(row.ahead)
+        n, here = len(row.ahead), slice(None) if row.seen.present.all() else np.flatnonzero(row.seen.present)
         spacing = np.where(row.ahead >= 0, row.seen.position[row.ahead] - row.seen.position, np.nan)
         motion = row.motion
         extra: dict[str, Any] = {}
         if self.has_units:
-            extra = self._units(row)
+            extra = self._units(row, here)
         if self.disturbances:
             acting = [np.full(n, np.nan)] * len(self.disturbances) if row.disturbed is None else row.disturbed
             extra |= dict(zip(self.disturbances, acting, strict=True))
-        self.recorder.write(
-            "trains", time_s=row.time, train=np.arange(n), track=row.track, edge=row.seen.edge, position_m=row.seen.position,
+        if row.led is not None:
+            extra["in_formation"] = row.led.astype(float)
+        columns = dict(
+            train=np.arange(n), track=row.track, edge=row.seen.edge, position_m=row.seen.position,
             speed_mps=row.speed, input_mps2=np.full(n, np.nan) if motion is None else motion.input, spacing_m=spacing,
             gap_m=spacing - self.train_length[row.ahead], saturated=row.saturated, **extra,
         )  # fmt: skip
+        if row.seen.present.any():
+            self.recorder.write("trains", time_s=row.time, **{name: column[here] for name, column in columns.items()})
         links = row.links
         if len(links.sender):
             self.recorder.write(
@@ -98,7 +106,7 @@ class Journal:
                 desired_m=links.desired, lower_m=links.lower, upper_m=links.upper, heard=links.heard,
             )  # fmt: skip
 
-    def _units(self, row: Row) -> dict[str, Any]:
+    def _units(self, row: Row, here: Any) -> dict[str, Any]:
         """Write the units; returns the further columns of the trains."""
         p, own = self.p, row.own
         missing = np.full(len(own), np.nan)
@@ -109,14 +117,17 @@ class Journal:
         force: Floats = missing if row.motion is None or row.motion.force is None else row.motion.force
         x = row.extremes
         assert x is not None
-        self.recorder.write(
-            "units", time_s=row.time, train=self.train_of_unit, unit=self.unit,
+        units = here if isinstance(here, slice) else np.flatnonzero(row.seen.present[self.train_of_unit])
+        values = dict(
+            train=self.train_of_unit, unit=self.unit,
             position_m=own[:, POSITION], speed_mps=own[:, SPEED], force_n=force,
             coupler_m=stretch, coupler_force_n=p.consists.stiffness * stretch + p.consists.damping * rate,
             coupler_min_m=_widened(np.fmin, x.coupler_min, stretch), coupler_max_m=_widened(np.fmax, x.coupler_max, stretch),
             force_min_n=_widened(np.fmin, x.force_min, force), force_max_n=_widened(np.fmax, x.force_max, force),
             **(row.motion.extras if row.motion is not None else dict.fromkeys(self.extras, missing)),
         )  # fmt: skip
+        if row.seen.present.any():
+            self.recorder.write("units", time_s=row.time, **{name: column[units] for name, column in values.items()})
         columns = {f"{name}_min": _finite(x.watched_min[:, q]) for q, name in enumerate(self.watched)}
         columns |= {f"{name}_max": _finite(x.watched_max[:, q]) for q, name in enumerate(self.watched)}
         return columns | {name: x.energy[:, q] for q, name in enumerate(ENERGIES)}

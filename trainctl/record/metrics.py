@@ -142,6 +142,8 @@ def of_bounds(trains: Series, units: Series, links: Series, known: Facts) -> Val
         if trains.names:
             lower, upper = np.repeat([limits.get(n, UNBOUNDED) for n in trains.names], np.diff(trains.first), axis=0).T
             value = trains.column(column)
+            if "in_formation" in trains.frame:  # a train alone is not driven by the law
+                value = np.where(trains.column("in_formation") > 0.5, value, np.nan)
             margins(f"{name}_lower_margin_{unit}", trains, value - lower, f"lower {name} bound of train")
             margins(f"{name}_upper_margin_{unit}", trains, upper - value, f"upper {name} bound of train")
     if units.names:

@@ -148,10 +148,10 @@ class Gui(Sumo):
         self._call(super().move, displacement, step)
         self._call(self._draw)
 
-    def _call(self, function: Any, *arguments: Any) -> Any:
+    def _call(self, function: Any, *arguments: Any, **more: Any) -> Any:
         """TraCI's own errors in the project's words."""
         try:
-            return function(*arguments)
+            return function(*arguments, **more)
         except traci.FatalTraCIError:
             raise SimulatorError(f"{self.binary} is gone before the end: was its window closed?") from None
         except traci.TraCIException as error:

@@ -318,10 +318,10 @@ class Sumo:
     def _time(self) -> float:
         return float(self.api.simulation.getTime()) - self.time_step
 
-    def _call(self, function: Any, *arguments: Any) -> Any:
+    def _call(self, function: Any, *arguments: Any, **more: Any) -> Any:
         """Libsumo's own errors in the project's words."""
         try:
-            return function(*arguments)
+            return function(*arguments, **more)
         except (self.api.TraCIException, self.api.FatalTraCIError) as error:
             where = f" at {self._time():.3f} s" if self.began and libsumo.simulation.isLoaded() else ""
             raise SimulatorError(f"SUMO{where}: {error}") from None

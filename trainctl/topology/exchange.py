@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -28,6 +28,10 @@ class Exchange:
     sent: deque[Floats] = field(default_factory=deque)
     heard: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     ever: Bools = field(default_factory=lambda: np.zeros(0, bool))
+
+    def copy(self) -> Exchange:
+        """The same at this moment, to come back to."""
+        return replace(self, sent=self.sent.copy(), heard=self.heard.copy(), ever=self.ever.copy())
 
     @property
     def perfect(self) -> bool:

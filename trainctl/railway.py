@@ -1,0 +1,434 @@
+"""Trains among each other on a net: who is ahead, whose turn it is at a switch, and what the supervisor allows.
+
+This is the part of the loop that knows ways. Where trains come and go (``network.sumocfg``) it also inserts them, drives those that
+are in no formation, stops them at their stations, and couples them.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from trainctl import lookout, supervisor
+from trainctl.lookout import View
+from trainctl.prepare import Prepared
+from trainctl.record.journal import Journal
+from trainctl.roster import Stop
+from trainctl.scenario import Traffic
+from trainctl.signals import POSITION, SPEED, Bools, Floats, Ints, Links, Reference, restrict
+from trainctl.supervisor import KINDS, STOP, SWITCH
+from trainctl.topology import along, claims, convoys
+from trainctl.topology.ways import Ways
+from trainctl.world import Seen
+
+#: A train that is slower and nearer to its stop than this has reached it [m/s], [m].
+STANDS_MPS, STOP_BAND_M = 0.05, 2.0
+
+#: What the driver keeps clear beyond the supervisor's margin, so that the latter has nothing to do [m].
+DRIVER_MARGIN_M = 10.0
+
+#: A train that waits to couple asks its law again after this [s].
+ASK_AGAIN_S = 2.0
+
+#: A train enters if it can do so with this share of its speed.
+ENTERS_WITH = 0.8
+
+#: Share of the reference speed above the least speed of a law below which a formation dissolves.
+DISSOLVES = 0.02
+
+
+class Lookout:
+    """Claims, and what is ahead of every train: state of the railway that all runs with ways have.
+
+    Attributes
+    ----------
+    claims : claims.State
+        Who has which switch and single track.
+    waits_for : ndarray, shape (n,)
+        Train that each is held by at a switch, -1 if none.
+    """
+
+    def __init__(self, p: Prepared) -> None:
+        self.p = p
+        self.rails, self.net = p.rails, along.net(p.rails)
+        self.length = p.consists.train_length()
+        self.claims = claims.none()
+        self.waits_for: Ints = np.full(len(self.length), -1)
+        self.theta = 0.0 if p.scenario.plant.kind == "point" else 0.5
+        rules = p.supervision
+        planned = [rules.service_mps2] + ([(p.scenario.traffic or Traffic()).deceleration_mps2] if p.roster else [])
+        self.rate = min(rules.emergency_mps2, *planned)
+        self.ways: Ways | None = None
+
+    def _reach(self, speed: Floats) -> Floats:
+        """How far ahead every train claims [m]: farther than it would brake for what it must not enter."""
+        v, step = np.maximum(speed, 0.0), self.p.scenario.run.step_s
+        braking = supervisor.stopping_distance(v, self.rate, step, self.theta)
+        return braking + 4.0 * v * step + self.p.supervision.margin_m + 2.0 * DRIVER_MARGIN_M + 50.0
+
+    def claim(self, t: float, ways: Ways, seen: Seen, speed: Floats, journal: Journal, entering: Bools) -> claims.Held:
+        """Let every train claim what lies within its reach; ``entering`` (n,) are those that ask to enter the net."""
+        if self.ways is not ways:  # they changed
+            self.ways, self.zones = ways, claims.zones(ways, self.net)
+        self.claims, held, said = claims.claim(
+            self.zones, self.claims, seen.row, seen.position, self.length, seen.present, self._reach(speed),
+            self.p.supervision.margin_m + DRIVER_MARGIN_M, entering,
+        )  # fmt: skip
+        self._tell(journal, t, said, held)
+        return held
+
+    def look(self, ways: Ways, seen: Seen, speed: Floats, held: claims.Held) -> View:
+        """What is ahead of every train."""
+        horizon = float(np.max(self._reach(speed), where=seen.present, initial=0.0)) + 1000.0
+        if self.p.roster is not None:
+            horizon = max(horizon, (self.p.scenario.traffic or Traffic()).join_range_m)
+        return lookout.look(
+            ways, self.net, self.rails.speed_mps, seen.row, seen.position, speed, self.length, seen.present, horizon, held.room,
+            claims.order(self.claims),
+        )  # fmt: skip
+
+    def _tell(self, journal: Journal, t: float, said: list[claims.Decision], held: claims.Held) -> None:
+        """Switches that another train has first, and those that became free."""
+        ids, edges = self.p.scenario.ids, self.rails.edges
+        for one in said:
+            if one.by >= 0:
+                journal.event(
+                    t, "conflict", train=ids[one.train], first=ids[one.by], edge=edges[one.zone],
+                    place="join" if one.join else "single_track",
+                )  # fmt: skip
+            elif one.granted and not one.join and self.waits_for[one.train] >= 0:
+                journal.event(t, "switch_granted", train=ids[one.train], edge=edges[one.zone])
+        self.waits_for = held.by.copy()
+
+
+class Supervision:
+    """The supervisor of a run: bounds accelerations, and tells when it begins and ends to do so.
+
+    Attributes
+    ----------
+    acting : ndarray, shape (n,)
+        Trains it acts on, or would act on.
+    """
+
+    def __init__(self, p: Prepared) -> None:
+        self.p, self.rules = p, p.supervision
+        self.acting: Bools = np.zeros(len(p.scenario.ids), bool)
+        self.theta = 0.0 if p.scenario.plant.kind == "point" else 0.5
+
+    def verdict(self, view: View, speed: Floats) -> supervisor.Verdict:
+        """What every train may do over the coming step."""
+        return supervisor.verdict(
+            self.rules, np.maximum(speed, 0.0), view.targets, view.limits, self.p.scenario.run.step_s, self.theta
+        )
+
+    def tell(self, journal: Journal, t: float, verdict: supervisor.Verdict, acts: Bools, view: View, speed: Floats) -> None:
+        """Events where it begins or ends to act."""
+        ids = self.p.scenario.ids
+        for i in np.flatnonzero(acts & ~self.acting).tolist():
+            reason, row = int(verdict.reason[i]), int(verdict.target[i])
+            more: dict[str, Any] = {"reason": KINDS[reason] if reason >= 0 else "acceleration"}
+            if 0 <= reason < len(KINDS) - 1:
+                other = int(view.targets.other[row])
+                more |= {"room_m": float(view.targets.room[row])} | ({"other": ids[other]} if other >= 0 else {})
+            elif reason >= 0:
+                more |= {"limit_mps": float(view.limits.speed[row]), "distance_m": float(view.limits.distance[row])}
+            journal.event(
+                t, "supervisor", train=ids[i], mode=self.rules.mode, emergency=bool(verdict.emergency[i]),
+                speed_mps=float(speed[i]), **more,
+            )  # fmt: skip
+        for i in np.flatnonzero(self.acting & ~acts).tolist():
+            journal.event(t, "supervisor_released", train=ids[i])
+        self.acting = acts
+
+
+class Pace(NamedTuple):
+    """Reference of every train's own formation now, shape (n,)."""
+
+    position: Floats  # m
+    speed: Floats  # m/s
+    acceleration: Floats  # m/s2
+
+
+class Service:
+    """Trains that come and go: departures, stops, driving outside of formations, and coupling.
+
+    Attributes
+    ----------
+    ahead : ndarray, shape (n,)
+        Train each is coupled to, -1 if none.
+    slot : ndarray, shape (n,)
+        Wanted position relative to the formation's reference [m].
+    offset : ndarray, shape (n,)
+        What is added to a train's measured position so that spacings in its formation are those along the way [m].
+    pace : Pace
+        References of the formations.
+    """
+
+    def __init__(self, p: Prepared) -> None:
+        assert p.roster is not None
+        self.p, self.roster = p, p.roster
+        self.driving = p.scenario.traffic or Traffic()
+        rules, top = p.supervision, p.scenario.topology
+        n = len(p.scenario.ids)
+        self.n, self.step = n, p.scenario.run.step_s
+        self.theta = 0.0 if p.scenario.plant.kind == "point" else 0.5
+        self.spacing = convoys.Spacing(
+            float(top.spacing_m or 0.0), -np.inf if top.lower_m is None else top.lower_m,
+            np.inf if top.upper_m is None else top.upper_m, top.weight,
+        )  # fmt: skip
+        self.cruise = np.minimum(float(p.scenario.reference.speed_mps or 0.0), self.roster.top_speed)
+        self.ahead: Ints = np.full(n, -1)
+        self.slot, self.offset = np.zeros(n), np.zeros(n)
+        own = p.own[p.heads]
+        self.pace = Pace(own[:, POSITION].copy(), own[:, SPEED].copy(), np.zeros(n))
+        self.came, self.left = np.zeros(n, bool), np.zeros(n, bool)
+        self.next_stop = np.zeros(n, np.int64)
+        self.stands_until = np.full(n, np.nan)  # s, while a train stands at a stop
+        self.stopping = np.zeros(n, bool)
+        self.ask_at = np.zeros(n)
+        # The driver brakes as planned and keeps farther away, so that the supervisor has nothing to do.
+        rate = min(self.driving.deceleration_mps2, rules.emergency_mps2)
+        self.rules = rules.model_copy(update={
+            "mode": "on", "emergency_mps2": rate, "service_mps2": rate, "greatest_mps2": self.driving.acceleration_mps2,
+            "margin_m": rules.margin_m + DRIVER_MARGIN_M, "emergency_distance_m": 0.0,
+        })  # fmt: skip
+
+    @property
+    def standing(self) -> Bools:
+        """Trains that stand at a stop."""
+        stands: Bools = ~np.isnan(self.stands_until)
+        return stands
+
+    @property
+    def led(self) -> Bools:
+        """Trains the law drives: members of a formation of two or more."""
+        member: Bools = self.ahead >= 0
+        member[self.ahead[member]] = True
+        return member
+
+    # Departures
+
+    def due(self, t: float) -> list[int]:
+        """Trains that are to come now: of each edge the first that waits there."""
+        first: dict[int, int] = {}
+        for i in np.flatnonzero(~self.came & (self.roster.depart <= t + 1e-9)).tolist():
+            first.setdefault(int(self.roster.edge[i]), i)
+        return sorted(first.values(), key=lambda i: (self.roster.depart[i], i))
+
+    def entering_speed(self, i: int, speed: Floats, view: View) -> float | None:
+        """Speed with which a train can enter safely; None if it has to wait. ``view`` is that with the train at its place."""
+        rules, v = self.rules, self.roster.speed[i]
+        on_edge = float(self.p.rails.speed_mps[self.roster.edge[i]]) - self.driving.below_limit_mps
+        wanted = float(min(self.cruise[i], max(on_edge, 0.0)) if np.isnan(v) else v)
+        here = view.targets.train == i
+        room = view.targets.room[here] - rules.margin_m
+        follows = view.targets.moving[here] & (view.targets.kind[here] == supervisor.TRAIN) & (rules.curve == "relative")
+        braking = supervisor.stopping_distance(view.targets.speed[here], rules.emergency_mps2, self.step, self.theta)
+        room = room + np.where(follows, braking, 0.0)
+        room = np.where(view.targets.kind[here] == supervisor.OPPOSING, 0.5 * room, room)
+        safe = supervisor.greatest_speed(room, rules.emergency_mps2, self.step, self.theta)
+        entry = float(min(wanted, *safe.tolist(), np.inf))
+        if np.any(view.targets.room[here] < rules.margin_m) or entry < (wanted - 1e-9 if not np.isnan(v) else ENTERS_WITH * wanted):
+            return None
+        other = int(view.ahead.train[i])
+        if other >= 0 and self.roster.cooperates[[i, other]].all() and view.ahead.spacing[i] < self.spacing.desired - 1.0:
+            return None
+        trial = speed.copy()
+        trial[i] = entry
+        behind = view.targets.other == i
+        if behind.any():
+            asked = lookout.of(view.targets, behind)
+            seen = supervisor.verdict(rules, trial, asked, supervisor.no_limits(), self.step, self.theta)
+            if np.any(seen.emergency[view.targets.train[behind]]):
+                return None
+        return entry
+
+    def enters(self, i: int, t: float, speed: float, journal: Journal) -> None:
+        """Take down that a train comes."""
+        self.came[i] = True
+        journal.event(
+            t, "depart", train=self.p.scenario.ids[i], planned_s=float(self.roster.depart[i]),
+            delay_s=t - float(self.roster.depart[i]), speed_mps=speed,
+        )  # fmt: skip
+
+    def arrivals(self, t: float, present: Bools, journal: Journal) -> None:
+        """Take down trains that have left at the end of their ways."""
+        gone = self.came & ~present & ~self.left
+        for i in np.flatnonzero(gone).tolist():
+            journal.event(t, "arrive", train=self.p.scenario.ids[i])
+        self.left |= gone
+
+    # Stops
+
+    def stop_of(self, i: int) -> Stop | None:
+        """The next stop of a train."""
+        stops, k = self.roster.stops[i], int(self.next_stop[i])
+        return stops[k] if k < len(stops) else None
+
+    def stops(self, t: float, seen: Seen, speed: Floats, journal: Journal) -> tuple[Ints, Floats]:
+        """Arrive at and leave stops; returns the trains that have one ahead and the room to it [m]."""
+        trains, rooms = [], []
+        for i in np.flatnonzero(seen.present & (self.next_stop < [len(s) for s in self.roster.stops])).tolist():
+            stop = self.stop_of(i)
+            assert stop is not None
+            room = stop.place - float(seen.position[i])
+            if self.standing[i]:
+                if t < self.stands_until[i] - 1e-9:
+                    continue
+                self.stands_until[i] = np.nan
+                self.next_stop[i] += 1
+                journal.event(t, "stop_left", train=self.p.scenario.ids[i], stop=stop.name)
+                stop = self.stop_of(i)
+                if stop is None:
+                    self.stopping[i] = False
+                    continue
+                room = stop.place - float(seen.position[i])
+            if speed[i] < STANDS_MPS and room < STOP_BAND_M:
+                self.stands_until[i] = max(t + stop.duration, stop.until)
+                journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=room)
+                continue
+            trains.append(i)
+            rooms.append(max(room, 0.0))
+        found, room_to = np.array(trains, np.int64), np.array(rooms)
+        braking = supervisor.stopping_distance(np.maximum(speed[found], 0.0), self.rules.service_mps2, self.step, self.theta)
+        near = np.zeros(self.n, bool)
+        near[found] = room_to < braking + 10.0 * self.step * speed[found] + 50.0
+        self.stopping = (self.stopping & seen.present | near) & (near | self.standing)
+        return found, room_to
+
+    # Formations
+
+    def couple(self, t: float, seen: Seen, own: Floats, view: View, journal: Journal) -> bool:
+        """Couple and uncouple trains; returns whether any formation changed. ``own`` is moved so that spacings agree."""
+        p, ids = self.p, self.p.scenario.ids
+        before = self.ahead.copy()
+        held = np.zeros(self.n, bool)
+        held[view.targets.train[(view.targets.kind == SWITCH) & ~view.targets.moving]] = True
+        willing = seen.present & self.roster.cooperates & ~self.stopping & ~self.standing & ~held
+        for i in convoys.broken(self.ahead, view.ahead.train, willing).tolist():
+            j = int(self.ahead[i])
+            why = "its train ahead is another one" if view.ahead.train[i] != j else "one of the two stops, waits or has left"
+            journal.event(t, "uncouple", train=ids[i], ahead=ids[j], reason=why)
+            self.ahead[i] = -1
+        for i in self._too_slow(own).tolist():
+            why = "the reference falls to the least speed of a member"
+            journal.event(t, "uncouple", train=ids[i], ahead=ids[int(self.ahead[i])], reason=why)
+            self.ahead[i] = -1
+        free = convoys.candidates(self.ahead, view.ahead.train, along.behind(view.ahead).train, willing)
+        for i in free[self.ask_at[free] <= t].tolist():
+            j, spacing = int(view.ahead.train[i]), float(view.ahead.spacing[i])
+            if self._fits(i, j, spacing, own) and convoys.fronts(self.ahead)[j] != i:
+                self.ask_at[i] = t + ASK_AGAIN_S
+                reasons = self._try(i, j, spacing, t, own)
+                if not reasons:
+                    journal.event(t, "couple", train=ids[i], ahead=ids[j], spacing_m=spacing)
+        changed = not np.array_equal(before, self.ahead)
+        alone = ~self.led
+        head = own[p.heads]
+        self.slot[alone] = 0.0
+        self.pace.position[alone], self.pace.speed[alone] = head[alone, POSITION], head[alone, SPEED]
+        self.pace.acceleration[alone] = 0.0
+        return changed
+
+    def _fits(self, i: int, j: int, spacing: float, own: Floats) -> bool:
+        """Whether spacing and speeds are right for coupling."""
+        p, d = self.p, self.driving
+        speed = own[p.heads, SPEED]
+        inside = all(p.bounds.speed_lower[k] < speed[k] < p.bounds.speed_upper[k] for k in (i, j))
+        predicted = spacing + (speed[j] - speed[i]) * (p.scenario.run.control_period_s or self.step)
+        return (
+            inside
+            and abs(spacing - self.spacing.desired) <= d.join_band_m
+            and self.spacing.lower <= min(spacing, predicted)
+            and max(spacing, predicted) <= self.spacing.upper
+            and abs(speed[i] - speed[j]) <= d.join_band_mps
+        )
+
+    def _try(self, i: int, j: int, spacing: float, t: float, own: Floats) -> list[str]:
+        """Couple ``i`` to ``j`` if the law's start condition holds for the longer formation; returns what it objects to."""
+        p, front = self.p, convoys.fronts(self.ahead)
+        behind, before = np.flatnonzero(front == front[i]), np.flatnonzero(front == front[j])
+        heads = p.heads
+        shift = own[heads[j], POSITION] - spacing - own[heads[i], POSITION]
+        moved = own.copy()
+        units = np.repeat(np.isin(np.arange(self.n), behind), np.diff(p.consists.first))
+        moved[units, POSITION] += shift
+        ahead = self.ahead.copy()
+        ahead[i] = j
+        order = convoys.front_to_rear(ahead)
+        slot = convoys.slots(ahead, order, self.spacing.desired, self.slot)
+        lead = int(front[j])
+        scene = p.scene(moved, convoys.links(ahead, order, slot, self.spacing), t)._replace(
+            reference=Reference(np.array([t, np.inf]), np.array([[self.pace.position[lead], self.pace.speed[lead], 0.0]]))
+        )
+        members = np.sort(np.concatenate([before, behind]))
+        reasons: list[str] = p.law.violations(p.params, restrict(scene, members))
+        if not reasons:
+            self.ahead, self.slot = ahead, slot
+            self.offset[behind] += shift
+            own[units, POSITION] += shift
+            for part in self.pace:
+                part[behind] = part[lead]
+        return reasons
+
+    def _too_slow(self, own: Floats) -> Ints:
+        """Coupled trains of formations whose reference nears the least speed of a member."""
+        least = self.p.bounds.speed_lower
+        floor = np.where(np.isfinite(least), least, 0.0) + DISSOLVES * self.cruise
+        front = convoys.fronts(self.ahead)
+        slow = np.zeros(self.n, bool)
+        np.logical_or.at(slow, front, self.pace.speed < floor)
+        return np.flatnonzero((self.ahead >= 0) & slow[front])
+
+    def links(self) -> Links:
+        """Who hears whom."""
+        order = convoys.front_to_rear(self.ahead)
+        self.slot = convoys.slots(self.ahead, order, self.spacing.desired, self.slot)
+        return convoys.links(self.ahead, order, self.slot, self.spacing)
+
+    # Driving
+
+    def drive(self, seen: Seen, speed: Floats, view: View, stops: tuple[Ints, Floats]) -> Floats:
+        """Set the pace of formations and return the accelerations of trains that are driven [m/s2], NaN where the law drives."""
+        led, front = self.led, convoys.fronts(self.ahead)
+        first = front == np.arange(self.n)
+        v = np.maximum(np.where(led, self.pace.speed, speed), 0.0)
+        limits = view.limits._replace(speed=np.maximum(view.limits.speed - self.driving.below_limit_mps, 0.2 * view.limits.speed))
+        by_limits = supervisor.verdict(self.rules, v, supervisor.no_targets(), limits, self.step, self.theta).greatest
+        targets = lookout.with_targets(lookout.of(view.targets, first[view.targets.train]), *stops, STOP)
+        free = supervisor.verdict(self.rules, v, targets, supervisor.no_limits(), self.step, self.theta).greatest
+        lowest = np.full(self.n, np.inf)
+        np.minimum.at(lowest, front, np.minimum(by_limits, np.where(first, free, np.inf)))
+        wish = (self._wish(seen, v, view) - v) / self.step
+        rate = np.minimum(np.maximum(wish, -self.driving.deceleration_mps2), lowest)
+        rate = np.maximum(np.minimum(rate, self.driving.acceleration_mps2), -v / self.step)[front]
+        rate = np.where(self.standing, 0.0, rate)
+        self.pace.acceleration[:] = np.where(led, rate, 0.0)
+        return np.where(led, np.nan, rate)
+
+    def _wish(self, seen: Seen, v: Floats, view: View) -> Floats:
+        """Speed every first train would like to have: the cruising speed, or one that brings it to its place behind a formation."""
+        other, wish = view.ahead.train, self.cruise.copy()
+        near = np.flatnonzero(
+            (other >= 0) & self.roster.cooperates & self.roster.cooperates[other] & ~self.stopping & ~self.stopping[other]
+            & ~self.standing[other] & (view.ahead.spacing <= self.driving.join_range_m) & (self.ahead != other)
+        )  # fmt: skip
+        j = other[near]
+        target = v[j] + convoys.closing_speed(view.ahead.spacing[near] - self.spacing.desired)
+        most = np.minimum(self.cruise[near] + self.driving.catch_up_mps, self.roster.top_speed[near])
+        upper = self.p.bounds.speed_upper[near]
+        most = np.where(np.isfinite(upper), np.minimum(most, upper - 0.25 * (upper - self.cruise[near])), most)
+        wish[near] = np.clip(target, 0.0, np.maximum(most, 0.0))
+        return wish
+
+    def advance(self) -> None:
+        """Let the references of all formations go on by a step."""
+        v, a = self.pace.speed, self.pace.acceleration
+        after = v + a * self.step
+        self.pace.position[:] += ((1.0 - self.theta) * v + self.theta * after) * self.step
+        self.pace.speed[:] = after
+
+    def leader(self) -> Floats:
+        """Position, speed, acceleration and jerk of every train's own reference, shape (4, n)."""
+        return np.stack([*self.pace, np.zeros(self.n)])

@@ -1,0 +1,151 @@
+"""The trains of a SUMO configuration as the loop needs them: ways, departures and stops, on a map of the whole net."""
+
+from __future__ import annotations
+
+import fnmatch
+import math
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from sumo_net import Line, LineError, Rails
+from sumo_net.layout import Gradient
+from trainctl.errors import InputError
+from trainctl.scenario import Scenario, Train, TrainType
+from trainctl.scenario import Traffic as Driving
+from trainctl.signals import Bools, Floats, Ints
+from trainctl.traffic import Departure, Traffic, read_traffic, train_type
+
+
+class Stop(NamedTuple):
+    """A place on a train's way where it stands."""
+
+    place: float  # m, position of the front
+    duration: float  # s
+    until: float  # s, it does not leave before; -inf if it may
+    name: str
+
+
+class Roster(NamedTuple):
+    """Trains that come and go, n of them."""
+
+    depart: Floats  # (n,) s
+    edge: Ints  # (n,) first edge of the way
+    lane_position: Floats  # (n,) m, front, at departure
+    speed: Floats  # (n,) m/s at departure, NaN: as fast as is safe
+    top_speed: Floats  # (n,) m/s
+    routes: tuple[tuple[str, ...], ...]  # edge ids, internal ones included
+    stops: tuple[tuple[Stop, ...], ...]
+    cooperates: Bools  # (n,)
+    vclass: tuple[str, ...]
+    notes: tuple[str, ...]  # what of the configuration is not followed
+    rails: Rails
+
+
+def chart(rails: Rails) -> Line:
+    """A whole net in the shape of a line: every normal edge is a track of its own, and takes the internal ones that lead to it."""
+    tracks = [rails.edges[_leads_to(rails, e)] for e in range(len(rails.edges))]
+    names = tuple(e for e, inside in zip(rails.edges, rails.internal, strict=True) if not inside)
+    return Line(
+        edges=rails.edges, tracks=tuple(tracks), start_m=rails.start_m, length_m=rails.length_m, speed_mps=rails.speed_mps,
+        crossovers=(), gradient=Gradient(np.zeros(1), np.zeros(1)), track_ids=names, begin_m=float(rails.start_m.min()),
+        end_m=float((rails.start_m + rails.length_m).max()),
+    )  # fmt: skip
+
+
+def _leads_to(rails: Rails, edge: int) -> int:
+    while rails.internal[edge] and rails.after[edge]:
+        edge = rails.after[edge][0]
+    return edge
+
+
+def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
+    """Read the traffic of a scenario with ``network.sumocfg``.
+
+    Returns
+    -------
+    tuple
+        The scenario with its trains and their types, the roster, and the file of the net.
+
+    Raises
+    ------
+    InputError
+        Everything that is wrong with the configuration, its net, its trains and their data.
+    """
+    with tempfile.TemporaryDirectory(prefix="traffic.") as work:
+        traffic = read_traffic(folder / str(scenario.network.sumocfg), Path(work), scenario.run.duration_s)
+    try:
+        rails = Rails.read(traffic.net)
+    except LineError as error:
+        raise InputError([f"network.sumocfg: {m}" for m in error.mistakes]) from None
+    types, found = _types(scenario, traffic)
+    driving = scenario.traffic or Driving()
+    ids = [d.id for d in traffic.departures]
+    together = np.array([any(fnmatch.fnmatchcase(i, p) for p in driving.cooperate) for i in ids], bool)
+    found += [
+        f"traffic.cooperate = {p}: no train of that name; there are: {', '.join(ids[:8])}{' ...' if len(ids) > 8 else ''}"
+        for p in driving.cooperate
+        if not any(fnmatch.fnmatchcase(i, p) for i in ids)
+    ]
+    trains, routes, stops = [], [], []
+    for d in traffic.departures:
+        try:
+            way = rails.way(d.edges)
+        except ValueError as error:
+            found.append(f"network.sumocfg: train {d.id}: {error}")
+            continue
+        begin = rails.start_m[way[0]] + np.concatenate([[0.0], np.cumsum(rails.length_m[way[:-1]])])
+        routes.append(tuple(rails.edges[e] for e in way.tolist()))
+        stops.append(_stops(d, rails, way, begin, traffic.begin_s))
+        trains.append(
+            Train(
+                id=d.id, type=d.kind, track=d.edges[0], position_m=float(begin[0] + d.position_m),
+                speed_mps=min(float(d.speed_mps if d.speed_mps is not None else scenario.reference.speed_mps or 0.0),
+                              traffic.kinds[d.kind].max_speed_mps),
+            )
+        )  # fmt: skip
+    if found:
+        raise InputError(list(dict.fromkeys(found)))
+    departures = traffic.departures
+    roster = Roster(
+        depart=np.array([max(d.depart_s - traffic.begin_s, 0.0) for d in departures]),
+        edge=np.array([rails.index[d.edges[0]] for d in departures], np.int64),
+        lane_position=np.array([d.position_m for d in departures]),
+        speed=np.array([math.nan if d.speed_mps is None else d.speed_mps for d in departures]),
+        top_speed=np.array([traffic.kinds[d.kind].max_speed_mps * traffic.kinds[d.kind].speed_factor for d in departures]),
+        routes=tuple(routes),
+        stops=tuple(stops),
+        cooperates=together,
+        vclass=tuple(traffic.kinds[d.kind].vclass for d in departures),
+        notes=traffic.notes,
+        rails=rails,
+    )
+    return scenario.model_copy(update={"train": tuple(trains), "train_type": types}), roster, traffic.net
+
+
+def _types(scenario: Scenario, traffic: Traffic) -> tuple[dict[str, TrainType], list[str]]:
+    """Data of every vType that runs: the scenario's own, else what the vType says of itself."""
+    types, found = dict(scenario.train_type), []
+    for name in dict.fromkeys(d.kind for d in traffic.departures):
+        if name not in types:
+            kind = train_type(traffic.kinds[name])
+            if isinstance(kind, list):
+                found += kind
+            else:
+                types[name] = kind
+        elif scenario.plant.kind == "point" and types[name].units > 1:
+            found.append(f"train_type.{name}.units = {types[name].units}: the point plant has one unit per train")
+    return types, found
+
+
+def _stops(departure: Departure, rails: Rails, way: Ints, begin: Floats, begin_s: float) -> tuple[Stop, ...]:
+    """Stops in the order of the way; one edge may be passed more than once."""
+    found, row = [], 0
+    for stop in departure.stops:
+        ahead = np.flatnonzero(way[row:] == rails.index[stop.edge])
+        row += int(ahead[0])
+        until = -math.inf if stop.until_s is None else stop.until_s - begin_s
+        found.append(Stop(float(begin[row] + stop.position_m), stop.duration_s, until, stop.name or stop.edge))
+    return tuple(found)
