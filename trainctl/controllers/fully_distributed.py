@@ -44,6 +44,7 @@ from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numba import njit
 from pydantic import Field
 
 from trainctl.signals import POSITION, SPEED, Bools, Consists, Demand, Floats, Links, Reference, Scene, Table, Trains, leader_at
@@ -130,43 +131,54 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
     -----
     Departs from [1]_ as the module says. delta > Delta does occur by rounding when a train sits on a bound.
     """
-    T, v, v_r = constants.period, own.speed, leader[SPEED]
-    z = message(constants, own, leader)[:, 0]
-    z_ji = np.where(links.heard, heard[:, 0] - z[links.receiver], links.desired)
-    gamma, Gamma = links.lower, links.upper
-    if constants.ratchet:
-        gamma, Gamma = np.minimum(gamma, z_ji), np.maximum(Gamma, z_ji)
-
-    neighbours = np.diff(links.first)
-    some = neighbours > 0  # reduceat mistakes an empty range for one element
-    begin = links.first[:-1][some]
-    alpha, Alpha = np.full_like(z, -np.inf), np.full_like(z, np.inf)
-    G, hold = np.zeros_like(z), np.zeros(len(z), dtype=bool)
-    alpha[some] = np.maximum.reduceat((z_ji - Gamma) / 2, begin)
-    Alpha[some] = np.minimum.reduceat((z_ji - gamma) / 2, begin)
-    G[some] = np.add.reduceat(z_ji - links.desired, begin) / (2 * neighbours[some])
-    hold[some] = np.logical_or.reduceat(~links.heard, begin)
-
-    beta, Beta = (constants.rho - v_r) * T, (constants.Rho - v_r) * T
-    eta, Eta = _input_room(constants, own, v_r)
-    delta = np.maximum(alpha, np.maximum(beta, eta))
-    Delta = np.minimum(Alpha, np.minimum(Beta, Eta))
-    sat = np.where(Delta <= G, Delta, np.maximum(G, delta))
-    s = np.where(hold, 0.0, sat)
-    return Demand(acceleration=(v_r + s / T - v) / T, saturated=(s != G) & ~hold)
+    n = len(own.speed)
+    acceleration, saturated = np.empty(n), np.empty(n, dtype=bool)
+    z, speed = message(constants, own, leader)[:, 0].copy(), np.ascontiguousarray(own.speed)
+    resistance, came = np.ascontiguousarray(own.resistance), np.ascontiguousarray(heard[:, 0])
+    _admitted(constants, z, speed, resistance, came, leader[SPEED], links, acceleration, saturated)
+    return Demand(acceleration, saturated)
 
 
-def _input_room(constants: Constants, own: Trains, v_r: float) -> tuple[Floats, Floats]:
-    """Eta of (10), both sides [m]."""
+@njit(cache=True, error_model="numpy")
+def _admitted(
+    constants: Constants, z: Floats, speed: Floats, resistance: Floats, heard: Floats, v_r: float, links: Links,
+    acceleration: Floats, saturated: Bools,
+) -> None:  # fmt: skip
+    """Write what (10) to (12) give every train. ``np.minimum`` and ``np.maximum`` pass on what is not a number."""
     c, T = constants, constants.period
-    if not c.own_speed:
-        return c.Rho * T + (c.mu - c.f) * T**2 - v_r * T, c.rho * T + (c.Mu - c.F) * T**2 - v_r * T
-    least = greatest = own.resistance
-    if c.held:  # the input is acceleration plus resistance, and the latter changes while the former is held
-        now = _resistance(own.speed, c.davis)
-        least, greatest = own.resistance + (c.f - now), own.resistance + (c.F - now)
-    vbar = own.speed - v_r
-    return vbar * T + (c.mu - least) * T**2, vbar * T + (c.Mu - greatest) * T**2
+    for i in range(len(z)):
+        alpha, Alpha, total, hold = -np.inf, np.inf, 0.0, False
+        begin, end = links.first[i], links.first[i + 1]
+        for k in range(begin, end):
+            z_ji, gamma, Gamma = links.desired[k], links.lower[k], links.upper[k]
+            if links.heard[k]:
+                z_ji = heard[k] - z[i]
+            else:
+                hold = True
+            if c.ratchet:
+                gamma, Gamma = np.minimum(gamma, z_ji), np.maximum(Gamma, z_ji)
+            alpha, Alpha = np.maximum(alpha, (z_ji - Gamma) / 2), np.minimum(Alpha, (z_ji - gamma) / 2)
+            total += z_ji - links.desired[k]
+        G = total / (2 * (end - begin)) if end > begin else 0.0
+
+        v = speed[i]
+        beta, Beta = (c.rho[i] - v_r) * T, (c.Rho[i] - v_r) * T
+        if c.own_speed:
+            least = greatest = resistance[i]
+            if c.held:  # the input is acceleration plus resistance, and the latter changes while the former is held
+                now = c.davis[i, 0] + c.davis[i, 1] * v + c.davis[i, 2] * (v * v)
+                least, greatest = resistance[i] + (c.f[i] - now), resistance[i] + (c.F[i] - now)
+            vbar = v - v_r
+            eta, Eta = vbar * T + (c.mu[i] - least) * (T * T), vbar * T + (c.Mu[i] - greatest) * (T * T)
+        else:
+            eta = c.Rho[i] * T + (c.mu[i] - c.f[i]) * (T * T) - v_r * T
+            Eta = c.rho[i] * T + (c.Mu[i] - c.F[i]) * (T * T) - v_r * T
+        delta, Delta = np.maximum(alpha, np.maximum(beta, eta)), np.minimum(Alpha, np.minimum(Beta, Eta))
+        s = Delta if Delta <= G else np.maximum(G, delta)
+        saturated[i] = s != G and not hold
+        if hold:
+            s = 0.0
+        acceleration[i] = (v_r + s / T - v) / T
 
 
 def _resistance(v: Floats, davis: Floats) -> Floats:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from pydantic import Field, ValidationInfo, field_validator
 
 from trainctl.signals import GRAVITY, POSITION, SPEED, Bools, Consists, Floats, Table
@@ -177,18 +178,25 @@ def advance(constants: Constants, own: Floats, acceleration: Floats, step: float
     The order of (4): add w3, clamp the input, subtract the true resistance, add w2, clamp the speed. Departs from both papers
     in two things: a displacement below zero is clipped to 0, since trains on a network do not run backwards, and the gradient.
     """
-    x, v = own[:, POSITION], own[:, SPEED]
-    believed, climb = resistance(v, constants.davis), climbing(x, constants.gradient)
-    asked = believed + climb + acceleration + kick.input
-    applied = np.clip(asked, constants.input_lower, constants.input_upper)
-    free = v + applied * step - (constants.resistance_factor * believed + climb) * step + kick.speed
-    v_next = np.clip(free, constants.speed_lower, constants.speed_upper)
-    moved = v * step + kick.position
-    displacement = np.maximum(moved, 0.0)
-    return Moved(
-        own=np.column_stack((x + displacement, v_next)),
-        input=applied,
-        displacement=displacement,
-        limited=(applied != asked) | (v_next != free),
-        clipped=moved < 0.0,
-    )
+    moved = Moved(np.empty_like(own), *np.empty((2, len(own))), *np.empty((2, len(own)), dtype=bool))
+    _advance(constants, own, climbing(own[:, POSITION], constants.gradient), acceleration, step, kick, moved)
+    return moved
+
+
+@njit(cache=True, error_model="numpy")
+def _advance(constants: Constants, own: Floats, climb: Floats, acceleration: Floats, step: float, kick: Kick, moved: Moved) -> None:
+    """Write the step of every train into ``moved``. ``np.minimum`` and ``np.maximum`` pass on what is not a number."""
+    c = constants
+    for i in range(len(own)):
+        v = own[i, SPEED]
+        believed = c.davis[i, 0] + c.davis[i, 1] * v + c.davis[i, 2] * (v * v)
+        asked = believed + climb[i] + acceleration[i] + kick.input[i]
+        applied = np.minimum(np.maximum(asked, c.input_lower[i]), c.input_upper[i])
+        free = v + applied * step - (c.resistance_factor[i] * believed + climb[i]) * step + kick.speed[i]
+        v_next = np.minimum(np.maximum(free, c.speed_lower[i]), c.speed_upper[i])
+        distance = v * step + kick.position[i]
+        displacement = np.maximum(distance, 0.0)
+        moved.own[i, POSITION], moved.own[i, SPEED] = own[i, POSITION] + displacement, v_next
+        moved.input[i], moved.displacement[i] = applied, displacement
+        moved.limited[i] = applied != asked or v_next != free
+        moved.clipped[i] = distance < 0.0
