@@ -127,6 +127,21 @@ def blocked(railway, traffic, order, horizon, virtual, i):
         yield (spacing - length[j], j, 1) if virtual else (distance, j, 0)
 
 
+def runs_along(traffic, horizon, i, j):
+    """Whether from the front of ``j`` on both run over the same edges as far as ``i`` looks, from any of its edges."""
+    ways, row, s, _, _ = traffic
+    near = [int(ways.edge[k]) for k in range(row[i], ways.first[i + 1]) if ways.begin[k] - s[i] <= horizon]
+    whole = ways.edge[ways.first[j] : ways.first[j + 1]].tolist()
+    return any(whole[b : b + len(near) - a] == near[a:] for a in range(len(near)) for b in range(len(whole)))
+
+
+def standing(traffic, i):
+    """Trains of which a piece is on the way of ``i``."""
+    ways, row, _, _, _ = traffic
+    to_come = set(ways.edge[row[i] : ways.first[i + 1]].tolist())
+    return {j for j in range(len(row)) if to_come & {e for e, _ in bodies(traffic, j)}}
+
+
 @pytest.mark.parametrize("tree", [True, False])
 @settings(max_examples=150, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 9), horizon=st.sampled_from(HORIZONS))
@@ -148,6 +163,16 @@ def test_ahead_and_obstacles_are_those_of_the_slow_reference(tree, seed, n, hori
             assert stands.room[i] == min((room for room, _, _ in every), default=np.inf)
             assert not every or (stands.room[i], stands.train[i], stands.sense[i]) in every
             assert every or (stands.train[i], stands.sense[i]) == (-1, 0)
+        told = along.bodies(here, virtual)
+        rows = list(zip(told.train.tolist(), told.room.tolist(), told.other.tolist(), told.sense.tolist(), strict=True))
+        for i in range(n):
+            every = set(blocked(railway, traffic, order, horizon, virtual, i)) if present[i] else set()
+            mine = [row[1:] for row in rows if row[0] == i]
+            assert set(mine) <= every
+            hides = [room for room, j, sense in mine if sense == 1 and runs_along(traffic, horizon, i, j)]
+            if not hides:  # then every train that stands in the way is told
+                same_way = {(j, sense) for room, j, sense in every if sense == 1 and room <= horizon and j in standing(traffic, i)}
+                assert same_way <= {(j, sense) for _, j, sense in mine}
 
 
 @settings(max_examples=60, deadline=None)

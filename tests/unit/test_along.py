@@ -55,6 +55,15 @@ def test_a_tail_that_has_not_left_the_way_is_in_it_and_one_that_has_is_not():
     assert along.ahead(seen(FORK, [((A, M, L), 1, 1000, 100), ((A, M, R), 2, 100, 300)])).train[0] == -1
 
 
+def test_behind_a_tail_that_branches_off_the_next_body_is_told_and_behind_one_that_stays_none():
+    trains = [((A, M, L), 1, 1000, 100), ((A, M, R), 2, 100, 300), ((A, M, L), 2, 400, 100), ((A, M, L), 2, 700, 100)]
+    found = along.bodies(seen(FORK, trains))
+    assert found.other[found.train == 0].tolist() == [1, 2]
+    assert found.room[found.train == 0].tolist() == [800.0, 1300.0]
+    assert found.sense.tolist() == [1] * 3
+    assert found.train.tolist() == [0, 0, 2]
+
+
 def test_a_body_on_the_twin_comes_the_other_way_and_one_across_blocks_the_edge():
     net = SimpleNamespace(
         length_m=np.array([500.0, 400.0, 400.0, 30.0, 30.0]), before=[[], [0], [], [1], []],

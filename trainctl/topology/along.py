@@ -76,6 +76,7 @@ class Places(NamedTuple):
     horizon: float  # m
     piece_first: Ints  # (E + 1,) pieces on edge e: piece_first[e]:piece_first[e + 1], by depth
     piece_train: Ints  # (P,)
+    piece_row: Ints  # (P,) row of that edge in the way of the train
     depth: Floats  # (P,) m from the start of the edge to the front of the train, more than its length if the front has left it
     front: Ints  # (n,) piece with the front of train i, -1 if it is not on the net
     own_first: Ints  # (n + 1,) approaches of train i: own[own_first[i]:own_first[i + 1]], nearest first
@@ -93,8 +94,17 @@ class Ahead(NamedTuple):
     spacing: Floats  # (n,) m, front to front; inf: none
 
 
+class Bodies(NamedTuple):
+    """Everything in the way of trains that may matter, one row per train and body; sorted by train. See ``Obstacles``."""
+
+    train: Ints  # (B,) whose way
+    other: Ints  # (B,) whose body
+    room: Floats  # (B,) m
+    sense: Ints  # (B,)
+
+
 class Obstacles(NamedTuple):
-    """What stands in the way of each train."""
+    """What stands nearest in the way of each train."""
 
     room: Floats  # (n,) m from the front to it, negative: overlapping; inf: none
     train: Ints  # (n,) whose body it is, -1: none
@@ -160,7 +170,8 @@ def places(
     return Places(
         ways=ways, net=net, row=row, s=s, length=length,
         longest=float(length[present].max(initial=0.0)), horizon=float(horizon),
-        piece_first=_starts(ways.edge[at], edges), piece_train=train[by_depth], depth=depth[by_depth], front=front,
+        piece_first=_starts(ways.edge[at], edges), piece_train=train[by_depth], piece_row=at[by_depth],
+        depth=depth[by_depth], front=front,
         own_first=own_first, own=own, join_first=_starts(join, edges), join_train=comer[by_turn],
         join_row=join_row[by_turn], rank=rank[by_turn],
     )  # fmt: skip
@@ -206,8 +217,11 @@ def behind(ahead: Ahead) -> Ahead:
     return Ahead(train, spacing)
 
 
-def obstacles(places: Places, virtual: bool = True) -> Obstacles:
-    """Find the nearest occupied point on the way of each train.
+def bodies(places: Places, virtual: bool = True) -> Bodies:
+    """Find what is in the way of each train, from the nearest to what the others hide.
+
+    The nearest alone does not tell how far a train may go: the tail of one that branches off is gone in a moment, and there may be
+    another behind it. A train that will run all the way with this one as far as the horizon hides what lies beyond it.
 
     Parameters
     ----------
@@ -220,9 +234,9 @@ def obstacles(places: Places, virtual: bool = True) -> Obstacles:
 
     Returns
     -------
-    Obstacles
-        ``room`` (n,) [m], ``train`` (n,) and ``sense`` (n,): the speed of the body along the own way is ``sense`` times the speed
-        of that train, 0 for one across.
+    Bodies
+        ``train``, ``other``, ``room`` [m] and ``sense`` (B,): the speed of the body along the way is ``sense`` times the speed of
+        that train, 0 for one across. Of those that come the other way on one edge, lie across it, or come to one join, the nearest.
 
     Notes
     -----
@@ -230,9 +244,18 @@ def obstacles(places: Places, virtual: bool = True) -> Obstacles:
     the beginning. Bodies on the twin of an edge are mirrored. A body on an edge that crosses one of the way blocks it as a whole;
     a train that already is on a blocked edge is held only by trains that are deeper in. A train is no obstacle to itself.
     """
+    return Bodies(*_bodies(places, virtual))
+
+
+def obstacles(places: Places, virtual: bool = True) -> Obstacles:
+    """Find the nearest occupied point on the way of each train: ``room``, ``train`` and ``sense`` (n,), see ``bodies``."""
+    every = bodies(places, virtual)
     n = len(places.row)
     room, train, sense = np.full(n, np.inf), np.full(n, -1, np.int64), np.zeros(n, np.int64)
-    _obstacles(places, virtual, room, train, sense)
+    first = np.lexsort((every.room, every.train))  # of a train's rows the nearest first
+    nearest = first[np.flatnonzero(np.diff(every.train, prepend=-1))]
+    i = every.train[nearest]
+    room[i], train[i], sense[i] = every.room[nearest], every.other[nearest], every.sense[nearest]
     return Obstacles(room, train, sense)
 
 
@@ -312,39 +335,48 @@ def _comes_over_another_track(places: Places, i: int, k: int, j: int, m: int) ->
 
 
 @njit(cache=True)
-def _joining(places: Places, i: int, best: float, lengths: bool) -> tuple[int, float]:
-    """Nearest train that comes over another track and is ahead of ``i``, nearer than ``best``.
+def _joining(places: Places, i: int, own: int, best: float, lengths: bool) -> tuple[int, float]:
+    """Nearest train that comes over another track and is ahead of ``i`` at the join of its approach ``own``, nearer than ``best``.
 
     Returns the train or -1 and its spacing [m]. With ``lengths`` the nearest rear, and the spacing less the length.
     """
     begin, s = places.ways.begin, places.s
     slack = places.longest if lengths else 0.0
     found = -1
-    for q in range(places.own_first[i], places.own_first[i + 1]):
-        own = places.own[q]
-        k = places.join_row[own]
-        distance = begin[k] - s[i]
-        first = places.join_first[places.ways.edge[k]]
-        decided = first
-        while decided < own and places.rank[decided] != UNDECIDED:
-            decided += 1
-        # Decided turns come first and are few; the undecided ones before the own are in order of distance, from near to far.
-        p = own - 1
-        while p >= first:
-            j, m = places.join_train[p], places.join_row[p]
-            spacing = distance - (begin[m] - s[j])
-            if p >= decided and spacing - slack >= best:
-                p = decided - 1
-                continue
-            value = spacing - places.length[j] if lengths else spacing
-            over_another = j != i and _comes_over_another_track(places, i, k, j, m)
-            if over_another and value < best:
-                found, best = j, value
-            same_track = places.ways.edge[k - 1] == places.ways.edge[m - 1]
-            if p < decided and j != i and not lengths and (over_another or same_track):
-                break  # the last turn before the own; who goes before that one is not the next ahead
-            p -= 1
+    k = places.join_row[own]
+    distance = begin[k] - s[i]
+    first = places.join_first[places.ways.edge[k]]
+    decided = first
+    while decided < own and places.rank[decided] != UNDECIDED:
+        decided += 1
+    # Decided turns come first and are few; the undecided ones before the own are in order of distance, from near to far.
+    p = own - 1
+    while p >= first:
+        j, m = places.join_train[p], places.join_row[p]
+        spacing = distance - (begin[m] - s[j])
+        if p >= decided and spacing - slack >= best:
+            p = decided - 1
+            continue
+        value = spacing - places.length[j] if lengths else spacing
+        over_another = j != i and _comes_over_another_track(places, i, k, j, m)
+        if over_another and value < best:
+            found, best = j, value
+        same_track = places.ways.edge[k - 1] == places.ways.edge[m - 1]
+        if p < decided and j != i and not lengths and (over_another or same_track):
+            break  # the last turn before the own; who goes before that one is not the next ahead
+        p -= 1
     return found, best
+
+
+@njit(cache=True)
+def _first_to_join(places: Places, i: int, own: int) -> int:
+    """A train that passes the join of the approach ``own`` of ``i`` before it, over another track; -1: none."""
+    k = places.join_row[own]
+    for p in range(own - 1, places.join_first[places.ways.edge[k]] - 1, -1):
+        j = places.join_train[p]
+        if j != i and _comes_over_another_track(places, i, k, j, places.join_row[p]):
+            return int(j)
+    return -1
 
 
 @njit(cache=True)
@@ -364,90 +396,116 @@ def _ahead(places: Places, train: Ints, spacing: Floats) -> None:
                 p += 1
             if p < places.piece_first[e + 1]:
                 j = places.piece_train[p]
-                if ways.edge[places.row[j]] == e and places.front[j] == p:  # not a tail whose front has left the edge
+                if places.front[j] == p:  # not a tail whose front has left the edge
                     if away + places.depth[p] <= places.horizon:
                         found, best = j, away + places.depth[p]
                     break
-        j, value = _joining(places, i, best, False)
-        if j >= 0:
-            found, best = j, value
+        for q in range(places.own_first[i], places.own_first[i + 1]):
+            j, value = _joining(places, i, places.own[q], best, False)
+            if j >= 0:
+                found, best = j, value
         train[i], spacing[i] = found, best
 
 
 @njit(cache=True)
-def _obstacles(places: Places, virtual: bool, room: Floats, train: Ints, sense: Ints) -> None:
+def _bodies(places: Places, virtual: bool) -> tuple[Ints, Ints, Floats, Ints]:
+    """Rows of ``Bodies``, counted first."""
+    n = len(places.row)
+    count = 0
+    for again in range(2):
+        train, other = np.empty(count * again, np.int64), np.empty(count * again, np.int64)
+        room, sense = np.empty(count * again), np.empty(count * again, np.int64)
+        count = 0
+        for i in range(n):
+            if places.front[i] >= 0:
+                begin = count
+                count = _in_the_way(places, virtual, i, again == 1, count, other, room, sense)
+                if again:
+                    train[begin:count] = i
+    return train, other, room, sense
+
+
+@njit(cache=True)
+def _in_the_way(
+    places: Places, virtual: bool, i: int, write: bool, count: int, other: Ints, room: Floats, sense: Ints
+) -> int:  # fmt: skip
+    """Write what is in the way of ``i`` from row ``count`` on, if ``write``; the next free row."""
     ways, net, s = places.ways, places.net, places.s
-    for i in range(len(room)):
-        if places.front[i] < 0:
-            continue
-        found, best, way = -1, np.inf, 0
-        inside = s[i] - ways.begin[places.row[i]]
-        for k in range(places.row[i], ways.first[i + 1]):
-            away = ways.begin[k] - s[i]
-            if away > places.horizon or away - places.longest >= best:
-                break
-            e = ways.edge[k]
-            here = k == places.row[i]
-            # The same way: by depth, so once the longest train could not come nearer none can.
-            p = places.front[i] + 1 if here else places.piece_first[e]
-            while p < places.piece_first[e + 1] and away + places.depth[p] - places.longest < best:
+    inside = s[i] - ways.begin[places.row[i]]
+    hidden = places.horizon  # from there on nothing matters
+    for k in range(places.row[i], ways.first[i + 1]):
+        away = ways.begin[k] - s[i]
+        if away > places.horizon or away - places.longest > hidden:
+            break
+        e = ways.edge[k]
+        here = k == places.row[i]
+        # The other way on the same track: the deepest is nearest.
+        t = net.twin[e]
+        if t >= 0:
+            for p in range(places.piece_first[t + 1] - 1, places.piece_first[t] - 1, -1):
                 j = places.piece_train[p]
-                rear = places.depth[p] - places.length[j]
-                value = away + (rear if virtual else max(rear, 0.0))
-                if j != i and value < best:
-                    found, best, way = j, value, 1
-                p += 1
-            # The other way on the same track: the deepest is nearest.
-            t = net.twin[e]
-            if t >= 0:
-                for p in range(places.piece_first[t + 1] - 1, places.piece_first[t] - 1, -1):
-                    j = places.piece_train[p]
-                    rear = max(places.depth[p] - places.length[j], 0.0)
-                    if j == i or (here and net.length[e] - rear <= inside):
-                        continue
-                    value = away + net.length[e] - min(places.depth[p], net.length[e])
-                    if value < best:
-                        found, best, way = j, value, -1
-                    break
-            for q in range(net.cross_first[e], net.cross_first[e + 1]):
-                c = net.cross[q]
-                for p in range(places.piece_first[c + 1] - 1, places.piece_first[c] - 1, -1):
-                    j = places.piece_train[p]
-                    if j == i or (here and not deeper(places.depth[p], j, inside, i)):
-                        continue
-                    if away < best:
-                        found, best, way = j, away, 0
-                    break
-        if best > places.horizon:
-            found, best, way = -1, np.inf, 0
-        if virtual:
-            j, value = _joining(places, i, best, True)
-            if j >= 0:
-                found, best, way = j, value, 1
-        else:
-            j, at = _join_to_keep_clear(places, i, best)
-            if j >= 0:
-                found, best, way = j, at, 0
-        room[i], train[i], sense[i] = best, found, way
-
-
-@njit(cache=True)
-def deeper(depth: float, j: int, inside: float, i: int) -> bool:
-    """Whether train ``j`` is farther in than train ``i``, ties by number."""
-    return depth > inside or (depth == inside and j < i)
-
-
-@njit(cache=True)
-def _join_to_keep_clear(places: Places, i: int, best: float) -> tuple[int, float]:
-    """Nearest join ahead of ``i`` that a train over another track passes first: that train or -1, and the distance [m]."""
+                rear = max(places.depth[p] - places.length[j], 0.0)
+                if j == i or (here and net.length[e] - rear <= inside):
+                    continue
+                value = away + net.length[e] - min(places.depth[p], net.length[e])
+                if value <= hidden:
+                    if write:
+                        other[count], room[count], sense[count] = j, value, -1
+                    count += 1
+                break
+        for q in range(net.cross_first[e], net.cross_first[e + 1]):
+            c = net.cross[q]
+            for p in range(places.piece_first[c + 1] - 1, places.piece_first[c] - 1, -1):
+                j = places.piece_train[p]
+                if j == i or (here and not _deeper(places.depth[p], j, inside, i)):
+                    continue
+                if away <= hidden:
+                    if write:
+                        other[count], room[count], sense[count] = j, away, 0
+                    count += 1
+                break
+        # The same way: by depth, so once the longest train would be hidden all are.
+        p = places.front[i] + 1 if here else places.piece_first[e]
+        while p < places.piece_first[e + 1] and away + places.depth[p] - places.longest <= hidden:
+            j, r = places.piece_train[p], places.piece_row[p]
+            rear = places.depth[p] - places.length[j]
+            value = away + (rear if virtual else max(rear, 0.0))
+            told = not here and rear < 0.0 and r > ways.first[j] and ways.edge[r - 1] == ways.edge[k - 1]
+            if told and k - 1 == places.row[i]:
+                told = _deeper(s[j] - ways.begin[r - 1], j, inside, i)
+            if j != i and not told and value <= hidden:
+                if write:
+                    other[count], room[count], sense[count] = j, value, 1
+                count += 1
+                if _runs_along(places, i, k, j, r):
+                    hidden = value
+            p += 1
     for q in range(places.own_first[i], places.own_first[i + 1]):
         own = places.own[q]
-        k = places.join_row[own]
-        distance = places.ways.begin[k] - places.s[i]
-        if distance >= best:
-            break
-        for p in range(own - 1, places.join_first[places.ways.edge[k]] - 1, -1):
-            j, m = places.join_train[p], places.join_row[p]
-            if j != i and _comes_over_another_track(places, i, k, j, m):
-                return j, distance
-    return -1, best
+        if virtual:
+            j, value = _joining(places, i, own, np.inf, True)
+            way = 1
+        else:
+            j, value, way = _first_to_join(places, i, own), ways.begin[places.join_row[own]] - s[i], 0
+        if j >= 0 and value <= hidden:
+            if write:
+                other[count], room[count], sense[count] = j, value, way
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def _runs_along(places: Places, i: int, k: int, j: int, r: int) -> bool:
+    """Whether ``j`` runs the way of ``i`` from their rows r and k as far as ``i`` looks."""
+    ways = places.ways
+    while k + 1 < ways.first[i + 1] and ways.begin[k + 1] - places.s[i] <= places.horizon:
+        k, r = k + 1, r + 1
+        if r == ways.first[j + 1] or ways.edge[k] != ways.edge[r]:
+            return False
+    return True
+
+
+@njit(cache=True)
+def _deeper(depth: float, j: int, inside: float, i: int) -> bool:
+    """Whether train ``j`` is farther in than train ``i``, ties by number."""
+    return depth > inside or (depth == inside and j < i)
