@@ -9,7 +9,7 @@ from numba import njit
 
 from trainctl.kernels import keep_by_sources
 from trainctl.signals import Bools, Floats, Ints
-from trainctl.supervisor import OPPOSING, SWITCH, TRAIN, Limits, Targets
+from trainctl.supervisor import LIMIT, OPPOSING, SWITCH, TRAIN, Limits, Params, Targets, Verdict, verdict
 from trainctl.topology import along
 from trainctl.topology.along import Ahead
 from trainctl.topology.ways import Ways
@@ -21,9 +21,10 @@ class View(NamedTuple):
     """What is ahead of every train now."""
 
     ahead: Ahead
-    targets: Targets
+    targets: Targets  # a train that joins ahead counts as if it were on the own track already
+    clear: Targets  # before a train that joins ahead the join itself is kept clear; a train needs to heed one of the two only
     limits: Limits
-    room: Floats  # (n,) m, to the body ahead; inf: none
+    room: Floats  # (n,) m, to the body on the own way; inf: none
     body: Ints  # (n,) whose it is, -1: none
 
 
@@ -56,11 +57,19 @@ def look(
         Targets are the bodies ahead and the places where trains are held, limits those of the edges under every train and ahead.
     """
     placed = along.places(ways, net, row, s, length, present, horizon, order)
-    ahead, body = along.ahead(placed), along.obstacles(placed)
+    ahead, body = along.ahead(placed), along.obstacles(placed, virtual=False)
+    clear = _targets(body, held, speed, present)
+    targets = _targets(along.obstacles(placed), held, speed, present) if len(placed.join_train) else clear
+    there = np.where(body.sense != 0, body.room, np.inf)
+    return View(ahead, targets, clear, Limits(*_limits(ways, limit, row, s, length, present, horizon)), there, body.train)
+
+
+def _targets(body: along.Obstacles, held: Floats, speed: Floats, present: Bools) -> Targets:
+    """Bodies in the way, and the places where trains are held."""
     blocked = np.flatnonzero((body.train >= 0) & present)
     kind = np.where(body.sense > 0, TRAIN, np.where(body.sense < 0, OPPOSING, SWITCH))[blocked]
     waits = np.flatnonzero(np.isfinite(held) & present)
-    targets = Targets(
+    return Targets(
         train=np.concatenate([blocked, waits]),
         room=np.concatenate([body.room[blocked], held[waits]]),
         speed=np.concatenate([np.where(kind == SWITCH, 0.0, speed[body.train[blocked]]), np.zeros(len(waits))]),
@@ -68,7 +77,6 @@ def look(
         kind=np.concatenate([kind, np.full(len(waits), SWITCH)]).astype(np.int64),
         other=np.concatenate([body.train[blocked], np.full(len(waits), -1)]),
     )
-    return View(ahead, targets, Limits(*_limits(ways, limit, row, s, length, present, horizon)), body.room, body.train)
 
 
 @njit(cache=True)
@@ -110,6 +118,23 @@ def with_targets(targets: Targets, train: Ints, room: Floats, kind: int) -> Targ
         kind=np.concatenate([targets.kind, np.full(n, kind, np.int64)]),
         other=np.concatenate([targets.other, np.full(n, -1, np.int64)]),
     )
+
+
+def judge(
+    params: Params, speed: Floats, targets: Targets, clear: Targets, limits: Limits, step: float, theta: float
+) -> Verdict:
+    """What every train may do: following the one that joins ahead, or keeping the join clear, whichever leaves more.
+
+    ``target`` of the verdict counts rows of ``clear`` on from those of ``targets``.
+    """
+    follows = verdict(params, speed, targets, limits, step, theta)
+    if targets is clear:
+        return follows
+    waits = verdict(params, speed, clear, limits, step, theta)
+    other = waits.greatest > follows.greatest
+    waits = waits._replace(target=waits.target + np.where((waits.reason >= 0) & (waits.reason != LIMIT), len(targets.train), 0))
+    fields = zip(waits[:5], follows[:5], strict=True)
+    return Verdict(*(np.where(other, a, b) for a, b in fields), follows.strongest)
 
 
 def of(targets: Targets, kept: Bools) -> Targets:

@@ -61,13 +61,29 @@ class Prepared:
         """The net as a graph, its edges numbered as those of the line."""
         return Rails.of(self.line) if self.roster is None else self.roster.rails
 
-    @property
+    @cached_property
     def supervision(self) -> supervisor.Params:
-        """How trains are protected: as the scenario says, else only where they come and go."""
-        stated = self.scenario.supervisor
-        if stated is None:
-            return supervisor.Params(mode="off" if self.roster is None else "on")
-        return stated
+        """How trains are protected: as the scenario says, else only where they come and go.
+
+        Where the scenario states no emergency braking it is the supervisor's usual one, or less if a train cannot give that.
+        """
+        stated = self.scenario.supervisor or supervisor.Params()
+        known: dict[str, Any] = {}
+        if "mode" not in stated.model_fields_set and self.roster is not None:
+            known["mode"] = "on"
+        if "emergency_mps2" not in stated.model_fields_set:
+            known["emergency_mps2"] = min(stated.emergency_mps2, math.floor(1000.0 * self.sure_braking.min()) / 1000.0)
+            known["service_mps2"] = min(stated.service_mps2, known["emergency_mps2"])
+        return stated.model_copy(update=known)
+
+    @cached_property
+    def sure_braking(self) -> Floats:
+        """Deceleration every train can give at any speed it may have [m/s2], shape (n,); infinite for points."""
+        if self.scenario.plant.kind == "point":
+            return np.full(len(self.scenario.train), np.inf)
+        fastest = np.where(np.isfinite(self.bounds.speed_upper), self.bounds.speed_upper, max(self.leader(0.0)[1], 1.0))
+        least, _ = shared.room(self.consists, np.zeros_like(fastest), fastest)
+        return -least
 
     @property
     def heads(self) -> Ints:
@@ -319,15 +335,16 @@ def _in_formation(scenario: Scenario, plan: graph.Plan) -> Scenario:
 
 def _can_brake(p: Prepared) -> list[str]:
     """Whether every train can do what the supervisor relies on."""
-    if p.supervision.mode == "off" or p.scenario.plant.kind == "point":
+    rules = p.supervision
+    short = np.flatnonzero(p.sure_braking < rules.emergency_mps2 - 1e-9) if rules.mode != "off" else np.zeros(0, np.int64)
+    if not len(short):
         return []
-    fastest = np.where(np.isfinite(p.bounds.speed_upper), p.bounds.speed_upper, max(p.leader(0.0)[1], 1.0))
-    least, _ = shared.room(p.consists, np.zeros_like(fastest), fastest)
+    i = int(short[np.argmin(p.sure_braking[short])])
+    least, among = p.sure_braking[i], f" (and {len(short) - 1} other trains too little)" if len(short) > 1 else ""
     return [
-        f"supervisor.emergency_mps2 = {p.supervision.emergency_mps2:g}: train {t.id} can brake with {-b:.6g} m/s2 at most"
-        for t, b in zip(p.scenario.train, least, strict=True)
-        if -b < p.supervision.emergency_mps2 - 1e-9
-    ][:3]
+        f"supervisor.emergency_mps2 = {rules.emergency_mps2:g}: train {p.scenario.ids[i]} can brake with {least:.6g} m/s2 at"
+        f" most{among}"
+    ]
 
 
 def _params(model: Any, keys: dict[str, Any], table: str) -> Any:

@@ -118,19 +118,20 @@ class Supervision:
 
     def verdict(self, view: View, speed: Floats) -> supervisor.Verdict:
         """What every train may do over the coming step."""
-        return supervisor.verdict(
-            self.rules, np.maximum(speed, 0.0), view.targets, view.limits, self.p.scenario.run.step_s, self.theta
+        return lookout.judge(
+            self.rules, np.maximum(speed, 0.0), view.targets, view.clear, view.limits, self.p.scenario.run.step_s, self.theta
         )
 
     def tell(self, journal: Journal, t: float, verdict: supervisor.Verdict, acts: Bools, view: View, speed: Floats) -> None:
         """Events where it begins or ends to act."""
-        ids = self.p.scenario.ids
+        ids, targets = self.p.scenario.ids, view.targets
+        others, rooms = (np.concatenate(pair) for pair in ((targets.other, view.clear.other), (targets.room, view.clear.room)))
         for i in np.flatnonzero(acts & ~self.acting).tolist():
             reason, row = int(verdict.reason[i]), int(verdict.target[i])
             more: dict[str, Any] = {"reason": KINDS[reason] if reason >= 0 else "acceleration"}
             if 0 <= reason < len(KINDS) - 1:
-                other = int(view.targets.other[row])
-                more |= {"room_m": float(view.targets.room[row])} | ({"other": ids[other]} if other >= 0 else {})
+                other = int(others[row])
+                more |= {"room_m": float(rooms[row])} | ({"other": ids[other]} if other >= 0 else {})
             elif reason >= 0:
                 more |= {"limit_mps": float(view.limits.speed[row]), "distance_m": float(view.limits.distance[row])}
             journal.event(
@@ -397,7 +398,8 @@ class Service:
         limits = view.limits._replace(speed=np.maximum(view.limits.speed - self.driving.below_limit_mps, 0.2 * view.limits.speed))
         by_limits = supervisor.verdict(self.rules, v, supervisor.no_targets(), limits, self.step, self.theta).greatest
         targets = lookout.with_targets(lookout.of(view.targets, first[view.targets.train]), *stops, STOP)
-        free = supervisor.verdict(self.rules, v, targets, supervisor.no_limits(), self.step, self.theta).greatest
+        clear = lookout.with_targets(lookout.of(view.clear, first[view.clear.train]), *stops, STOP)
+        free = lookout.judge(self.rules, v, targets, clear, supervisor.no_limits(), self.step, self.theta).greatest
         lowest = np.full(self.n, np.inf)
         np.minimum.at(lowest, front, np.minimum(by_limits, np.where(first, free, np.inf)))
         wish = (self._wish(seen, v, view) - v) / self.step

@@ -120,6 +120,8 @@ class Reroutes:
         line = self.p.line
         edge, position = int(seen.edge[i]), float(seen.position[i])
         track = line.tracks[edge]
+        if track == event.to_track:
+            raise Refused(f"the train is on track {track} already")
         try:
             if event.crossover is not None:
                 over = line.crossover[event.crossover]
