@@ -72,7 +72,7 @@ class Prepared:
         if "mode" not in stated.model_fields_set and self.roster is not None:
             known["mode"] = "on"
         if "emergency_mps2" not in stated.model_fields_set:
-            known["emergency_mps2"] = min(stated.emergency_mps2, math.floor(1000.0 * self.sure_braking.min()) / 1000.0)
+            known["emergency_mps2"] = math.floor(1000.0 * min(stated.emergency_mps2, self.sure_braking.min())) / 1000.0
             known["service_mps2"] = min(stated.service_mps2, known["emergency_mps2"])
         return stated.model_copy(update=known)
 
