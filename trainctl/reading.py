@@ -132,10 +132,10 @@ def _set(data: dict[str, Any], key: str, value: Any) -> None:
     table[last] = value
 
 
-def examine(data: dict[str, Any]) -> tuple[Scenario | None, list[str]]:
+def examine(data: dict[str, Any], resolved: bool = False) -> tuple[Scenario | None, list[str]]:
     """A scenario and all mistakes in its file.
 
-    With mistakes, the scenario is what remains without the keys that are wrong, so that the others can still be checked; None if
+    ``resolved`` says that it is the one of a run folder, which names the trains that were taken from ``network.sumocfg``. With mistakes, the scenario is what remains without the keys that are wrong, so that the others can still be checked; None if
     too little remains.
     """
     beyond = list(_beyond(data))
@@ -155,7 +155,7 @@ def examine(data: dict[str, Any]) -> tuple[Scenario | None, list[str]]:
             if isinstance(rest.get("run"), dict):
                 rest["run"].setdefault("duration_s", rest["run"].get("step_s", 1.0))  # nothing else is checked against it
         else:
-            wrong = scenario.cross_references()
+            wrong = scenario.cross_references(resolved)
             return (None if wrong else scenario), list(dict.fromkeys([*found, *wrong]))
     return None, list(dict.fromkeys(found))
 

@@ -338,10 +338,13 @@ class Scenario(Table):
         """Train ids in formation order."""
         return tuple(t.id for t in self.train)
 
-    def cross_references(self) -> list[str]:
-        """Mistakes between tables of this file: names that do not exist, lists of the wrong length."""
-        found = self._of_the_network()
-        if self.network.sumocfg is not None:
+    def cross_references(self, resolved: bool = False) -> list[str]:
+        """Mistakes between tables of this file: names that do not exist, lists of the wrong length.
+
+        A scenario as ``resolved`` has the trains of its SUMO configuration; in a user's file they would be another word for them.
+        """
+        found = self._of_the_network(resolved)
+        if self.network.sumocfg is not None and not resolved:
             return found
         ids, types = dict.fromkeys(self.ids), self.train_type
         for t in self.train:
@@ -365,7 +368,7 @@ class Scenario(Table):
             found += [f"train_type.{name}.units = {types[name].units}: the point plant has one unit per train" for name in many]
         return found
 
-    def _of_the_network(self) -> list[str]:
+    def _of_the_network(self, resolved: bool) -> list[str]:
         """Tables that do not go with where the trains come from."""
         if self.network.sumocfg is None:
             found = [] if self.train else ["train: missing; a scenario needs at least one [[train]], or network.sumocfg"]
@@ -376,7 +379,7 @@ class Scenario(Table):
         found = [
             f"{key}: not with network.sumocfg, whose {what}"
             for key, what in (("train", "own trains run"), ("link", "formations make their links as they form"))
-            if getattr(self, key)
+            if getattr(self, key) and not (resolved and key == "train")
         ]
         top = self.topology
         for key, usual in (("rule", "same_track"), ("desired", "slots"), ("first_slot_m", 0.0)):

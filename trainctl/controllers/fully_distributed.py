@@ -135,13 +135,14 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
     acceleration, saturated = np.empty(n), np.empty(n, dtype=bool)
     z, speed = message(constants, own, leader)[:, 0].copy(), np.ascontiguousarray(own.speed)
     resistance, came = np.ascontiguousarray(own.resistance), np.ascontiguousarray(heard[:, 0])
-    _admitted(constants, z, speed, resistance, came, leader[SPEED], links, acceleration, saturated)
+    wanted = np.ascontiguousarray(np.broadcast_to(leader[SPEED], n))  # formations that come and go have references of their own
+    _admitted(constants, z, speed, resistance, came, wanted, links, acceleration, saturated)
     return Demand(acceleration, saturated)
 
 
 @njit(cache=True, error_model="numpy")
 def _admitted(
-    constants: Constants, z: Floats, speed: Floats, resistance: Floats, heard: Floats, v_r: float, links: Links,
+    constants: Constants, z: Floats, speed: Floats, resistance: Floats, heard: Floats, reference: Floats, links: Links,
     acceleration: Floats, saturated: Bools,
 ) -> None:  # fmt: skip
     """Write what (10) to (12) give every train. ``np.minimum`` and ``np.maximum`` pass on what is not a number."""
@@ -161,7 +162,7 @@ def _admitted(
             total += z_ji - links.desired[k]
         G = total / (2 * (end - begin)) if end > begin else 0.0
 
-        v = speed[i]
+        v, v_r = speed[i], reference[i]
         beta, Beta = (c.rho[i] - v_r) * T, (c.Rho[i] - v_r) * T
         if c.own_speed:
             least = greatest = resistance[i]

@@ -46,7 +46,7 @@ def replay(run: Run, binary: str = "sumo-gui", from_s: float = 0.0, delay_ms: fl
     SimulatorError
         SUMO could not be started, or the window was closed.
     """
-    scenario, _ = examine(run.scenario)
+    scenario, _ = examine(run.scenario, resolved=True)
     if scenario is None:
         raise InputError(f"{run.folder}: its scenario.toml is damaged")
     ids = list(scenario.ids)
