@@ -107,7 +107,7 @@ class Alarms:
         yield from self._couplers(row)
         yield from self._constrained(row)
         yield from self._energies(row)
-        if row.led is None:  # otherwise ``along`` tells, since neighbours may be on other edges
+        if self.p.roster is None and self.p.supervision.mode == "off":  # otherwise ``overlaps`` tells, edge by edge
             yield from self._collisions(row)
         links = row.links
         spacing = row.seen.position[links.sender] - row.seen.position[links.receiver]
