@@ -178,7 +178,19 @@ LINE = railway(
      ("l", "U"), ("U", "B"), ("B", "T"), ("T", "S"), ("S", "q"), ("c", "y"), ("y", "d")],
     twins=[("s", "S"), ("t", "T"), ("u", "U")], crossings=[("x", "y")],
 )  # fmt: skip
-RIGHT = ("w1 j x r s t A u o", "w2 j x r s t A u o", "l U B T S q", "c y d")
+LINE_WAYS = ("w1 j x r s t A u o", "w2 j x r s t A u o", "l U B T S q", "c y d")
+
+#: Three single tracks with two passing loops, whose main track (m, M and n, N) trains of both directions use.
+LOOPS = railway(
+    {
+        "w": 1200, "s": 900, "m": 600, "a": 640, "t": 1300, "n": 500, "b": 540, "u": 800, "o": 900,
+        "l": 1200, "U": 800, "N": 500, "c": 540, "T": 1300, "M": 600, "d": 640, "S": 900, "q": 900,
+    },
+    [("w", "s"), ("s", "m"), ("s", "a"), ("m", "t"), ("a", "t"), ("t", "n"), ("t", "b"), ("n", "u"), ("b", "u"), ("u", "o"),
+     ("l", "U"), ("U", "N"), ("U", "c"), ("N", "T"), ("c", "T"), ("T", "M"), ("T", "d"), ("M", "S"), ("d", "S"), ("S", "q")],
+    twins=[("s", "S"), ("m", "M"), ("t", "T"), ("n", "N"), ("u", "U")],
+)  # fmt: skip
+LOOPS_WAYS = ("w s a t b u o", "w s m t b u o", "w s a t n u o", "l U c T d S q", "l U N T d S q", "l U c T M S q")
 
 
 def occupied(ways, row, s, length, i):
@@ -190,21 +202,21 @@ def occupied(ways, row, s, length, i):
         k -= 1
 
 
-def drive(seed, n=14, limit=6000):
+def drive(net_of, routes, seed, n, limit=9000):
     """Trains that always can stop before what stands in their way and before what is not theirs; returns when all have left."""
     rng = np.random.default_rng(seed)
-    kind = rng.integers(0, len(RIGHT), n)
-    ways = LINE.ways([[LINE.number[e] for e in RIGHT[k].split()] for k in kind])
-    net = along.net(LINE)
+    kind = rng.integers(0, len(routes), n)
+    ways = net_of.ways([[net_of.number[e] for e in routes[k].split()] for k in kind])
+    net = along.net(net_of)
     zones = claims.zones(ways, net)
     length = rng.uniform(40.0, 480.0, n)
     departs = np.sort(rng.uniform(0.0, 900.0, n))
     acceleration, top = rng.uniform(0.2, 0.8, n), rng.uniform(10.0, TOP, n)
-    end = ways.begin[ways.first[1:] - 1] + LINE.length_m[ways.edge[ways.first[1:] - 1]]
+    end = ways.begin[ways.first[1:] - 1] + net_of.length_m[ways.edge[ways.first[1:] - 1]]
     row, s, v = ways.first[:-1].copy(), np.zeros(n), np.zeros(n)
     present, left = np.zeros(n, bool), np.zeros(n, bool)
     state = claims.none()
-    turns = {}
+    turns, passed = set(), {}
     for step in range(limit):
         for i in np.flatnonzero(~present & ~left & (departs <= step)).tolist():
             rest = [s[j] - length[j] for j in np.flatnonzero(present).tolist() if ways.edge[row[j]] == ways.edge[ways.first[i]]]
@@ -221,8 +233,7 @@ def drive(seed, n=14, limit=6000):
         for i in np.flatnonzero(present).tolist():
             while row[i] + 1 < ways.first[i + 1] and ways.begin[row[i] + 1] <= s[i]:
                 row[i] += 1
-                if int(ways.edge[row[i]]) == LINE.number["j"]:
-                    turns.setdefault("passed", []).append(i)
+                passed.setdefault(int(ways.edge[row[i]]), []).append(i)
         gone = present & (s >= end)
         present &= ~gone
         left |= gone
@@ -233,39 +244,41 @@ def drive(seed, n=14, limit=6000):
         for e, bodies in on.items():
             bodies.sort()
             assert all(a[0] < b[1] for a, b in pairwise(bodies)), ("overlap", seed, step, e, bodies)
-            foes = [LINE.twin[e], *LINE.crossing[e]]
+            foes = [net_of.twin[e], *net_of.crossing[e]]
             assert not any(f in on for f in foes), ("foe", seed, step, e)
-        queue = state["joins"].get(str(LINE.number["j"]), [])
-        for a, b in pairwise(queue):
-            turns.setdefault("order", {})[a, b] = step
+        turns |= {(int(e), a, b) for e, queue in state["joins"].items() for a, b in pairwise(queue)}
         if left.all():
-            passed = turns.get("passed", [])
-            place = {i: k for k, i in enumerate(passed)}
-            assert all(place[a] < place[b] for a, b in turns.get("order", {}))
+            assert all(passed[e].index(a) < passed[e].index(b) for e, a, b in turns)
             return step
     raise AssertionError(f"seed {seed}: {np.flatnonzero(~left).tolist()} never arrive: {s}, {ways.edge[row]}, {state}, {held}")
 
 
 @pytest.mark.parametrize(("seed", "n"), [(0, 10), (1, 10), (2, 14), (1001, 18)])
-def test_on_a_line_with_all_of_it_nobody_meets_and_everybody_arrives(seed, n):
-    assert drive(seed, n) > 0
+def test_with_a_join_a_crossing_and_a_passing_loop_nobody_meets_and_everybody_arrives(seed, n):
+    drive(LINE, LINE_WAYS, seed, n)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_with_two_passing_loops_nobody_meets_and_everybody_arrives(seed):
+    drive(LOOPS, LOOPS_WAYS, seed, 10)
 
 
 @pytest.mark.campaign
-def test_campaign_two_hundred_lines():
+@pytest.mark.parametrize(("net", "routes"), [(LINE, LINE_WAYS), (LOOPS, LOOPS_WAYS)], ids=["line", "loops"])
+def test_campaign_two_hundred_days(net, routes):
     for seed in range(200):
-        drive(1000 + seed, n=18)
+        drive(net, routes, 1000 + seed, 18)
 
 
-@pytest.mark.parametrize("kind", range(len(RIGHT)))
+@pytest.mark.parametrize("kind", range(len(LINE_WAYS)))
 def test_alone_nobody_is_held(kind):
-    path = RIGHT[kind].split()
-    others = [(way, way.split()[0], 0, 50) for way in RIGHT]  # their ways make the stretches
-    yard = Yard(LINE, [*others, (RIGHT[kind], path[0], 0, 480)])
+    path = LINE_WAYS[kind].split()
+    others = [(way, way.split()[0], 0, 50) for way in LINE_WAYS]  # their ways make the stretches
+    yard = Yard(LINE, [*others, (LINE_WAYS[kind], path[0], 0, 480)])
     yard.present[:-1] = False
     for edge in path:
         for part in (0.0, 0.5, 1.0):
-            yard.put(len(RIGHT), edge, part * LINE.length_m[LINE.number[edge]])
+            yard.put(len(LINE_WAYS), edge, part * LINE.length_m[LINE.number[edge]])
             held, said = yard.now()
             assert np.isinf(held.room).all()
             assert all(d.granted for d in said)

@@ -115,8 +115,9 @@ def claim(
 
     Notes
     -----
-    A train whose front is in a stretch has it, as a fact. Trains on the way to one edge keep the order they stand in, or, where
-    they come over different tracks, the order of their turns at the join.
+    A train whose front is in a stretch has it, as a fact. Turns at joins within a stretch come with it, and none beyond a stretch
+    that is not granted: else one who waits for the stretch could be first where one who has it must pass. Trains on the way to one
+    edge keep the order they stand in, or, where they come over different tracks, the order of their turns at the join.
     """
     outside = np.zeros(len(row), bool) if entering is None else entering
     until = s + reach
@@ -130,7 +131,9 @@ def claim(
         (joins if is_join else stretches).setdefault((i, int(edge[k])), k)
     trains = _Trains(zones, row, s, length, *_coming(zones, row, present))
 
-    queues, said = _turns(trains, state["joins"], joins)
+    queues = {int(e): [i for i in queue if (i, int(e)) in joins] for e, queue in state["joins"].items()}
+    leave = {(i, e): g for i, e, g in state["stretches"]}
+    said = _turns(trains, queues, joins, _open(joins, stretches, leave))
     order, granted = _queue(trains, state["stretches"], stretches, queues)
     new = granted.keys() - {(i, e) for i, e, _ in state["stretches"]}
     held, waiting = _Index(zones, trains), _Index(zones, trains)
@@ -182,8 +185,16 @@ def claim(
             granted[one] = True
             until[i] = max(until[i], begin[r])
             _lead(leading, zones, i, r)
+    for (i, e), k in stretches.items():
+        if granted[i, e]:  # with it go the turns within it
+            last = int(zones.ends[k])
+            until[i] = max(until[i], begin[last])
+            for r in range(max(k, int(zones.ways.first[i]) + 1), last + 1):
+                if zones.net.joins[edge[r]] and begin[r] > s[i] - length[i]:
+                    joins.setdefault((i, int(edge[r])), r)
+    said += _turns(trains, queues, joins, _open(joins, stretches, granted))
     now = State(
-        joins={str(e): queue for e, queue in queues.items()},
+        joins={str(e): queue for e, queue in queues.items() if queue},
         stretches=[(i, e, granted[i, e]) for i, e in order],
         until={str(i): float(until[i]) for i in sorted({i for i, _ in (*joins, *stretches)})},
     )
@@ -215,30 +226,40 @@ class _Trains(NamedTuple):
         while k > self.row[i] and m > self.row[j]:
             if edge[k - 1] != edge[m - 1]:
                 turns = queues.get(int(edge[k]), [])
-                return turns.index(i) < turns.index(j) if i in turns and j in turns else nearer
+                if i in turns and j in turns:
+                    return turns.index(i) < turns.index(j)
+                return i in turns or (j not in turns and nearer)
             k, m = k - 1, m - 1
         return nearer
 
 
+def _open(
+    joins: dict[tuple[int, int], int], stretches: dict[tuple[int, int], int], granted: dict[tuple[int, int], bool]
+) -> dict[tuple[int, int], int]:
+    """Those joins that trains may take a turn at: no stretch they have not been granted contains them or lies before."""
+    shut: dict[int, int] = {}
+    for (i, e), k in stretches.items():
+        if not granted.get((i, e), False):
+            shut[i] = min(k, shut.get(i, k))
+    return {(i, e): k for (i, e), k in joins.items() if i not in shut or k < shut[i]}
+
+
 def _turns(
-    trains: _Trains, before: dict[str, list[int]], near: dict[tuple[int, int], int]
-) -> tuple[dict[int, list[int]], list[Decision]]:
-    """Queues at joins, those who left taken out and new ones in: last, unless they stand before another from the same track."""
+    trains: _Trains, queues: dict[int, list[int]], near: dict[tuple[int, int], int], new: dict[tuple[int, int], int]
+) -> list[Decision]:
+    """Put new trains into the queues at joins: last, unless they stand before another from the same track."""
     edge = trains.zones.ways.edge
-    queues = {int(e): [i for i in queue if (i, int(e)) in near] for e, queue in before.items()}
-    queues = {e: queue for e, queue in queues.items() if queue}
-    known = {(i, e) for e, queue in queues.items() for i in queue}
     said = []
-    for (i, e), k in sorted(near.items(), key=lambda item: (trains.distance(item[0][0], item[1]), item[0])):
-        if (i, e) in known:
-            continue
+    for (i, e), k in sorted(new.items(), key=lambda item: (trains.distance(item[0][0], item[1]), item[0])):
         queue = queues.setdefault(e, [])
+        if i in queue:
+            continue
         same = (t for t, j in enumerate(queue) if edge[near[j, e] - 1] == edge[k - 1])
         turn = next((t for t in same if trains.goes_before(i, k, queue[t], near[queue[t], e], queues)), len(queue))
         queue.insert(turn, i)
         others = [j for j in queue[:turn] if edge[near[j, e] - 1] != edge[k - 1]]
         said.append(Decision(i, e, not others, others[-1] if others else -1, True))
-    return queues, said
+    return said
 
 
 def _queue(
