@@ -135,7 +135,8 @@ def _set(data: dict[str, Any], key: str, value: Any) -> None:
 def examine(data: dict[str, Any], resolved: bool = False) -> tuple[Scenario | None, list[str]]:
     """A scenario and all mistakes in its file.
 
-    ``resolved`` says that it is the one of a run folder, which names the trains that were taken from ``network.sumocfg``. With mistakes, the scenario is what remains without the keys that are wrong, so that the others can still be checked; None if
+    ``resolved`` says that it is the one of a run folder, which names the trains that were taken from ``network.sumocfg``.
+    With mistakes, the scenario is what remains without the keys that are wrong, so that the others can still be checked; None if
     too little remains.
     """
     beyond = list(_beyond(data))

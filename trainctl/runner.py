@@ -119,6 +119,8 @@ def opened(
     step = p.scenario.run.step_s
     if every is not None and not (every >= step and abs(every / step - round(every / step)) < 1e-6):
         raise InputError(f"--checkpoint-every {every:g}: must be a multiple of step_s = {step:g}")
+    if every is not None and p.roster is not None:
+        raise InputError("--checkpoint-every: a run with network.sumocfg cannot be resumed yet; leave it out")
     if every is not None and gui is not None:
         raise InputError("--checkpoint-every: a run that is watched cannot be resumed; leave out --gui")
     partial = claim(out, force)
@@ -329,6 +331,8 @@ def again(partial: Path) -> tuple[Prepared, float | None]:
     except (OSError, ValueError) as error:
         raise InputError(f"{partial}: it was killed before it began: begin it again with `trainctl run` ({error})") from None
     network, file = data["network"], str(place / "network.toml")
+    if "sumocfg" in network:
+        raise InputError(f"{partial}: a run with network.sumocfg cannot be resumed yet: begin it again with `trainctl run`")
     if "net" in start:
         data["network"] = {"net": str(place / start["net"])}
     elif network["line"].endswith(".toml"):
@@ -366,9 +370,9 @@ def open_world(p: Prepared, folder: Path, backend: Backend, gui: str | None = No
     except LineError as error:
         raise SimulatorError("; ".join(error.mistakes)) from None
     if gui is not None:
-        from trainctl.sumo.gui import Gui
+        from trainctl.sumo.gui import Gui, Map
 
-        return Gui(p.line, net, place, p.scenario.run.step_s, p.scenario.run.steps, gui)
+        return (Gui if p.roster is None else Map)(p.line, net, place, p.scenario.run.step_s, p.scenario.run.steps, gui)
     return Sumo(p.line, net, place, p.scenario.run.step_s, p.scenario.run.steps)
 
 

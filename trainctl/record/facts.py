@@ -35,7 +35,9 @@ class Facts:
     length_m: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     traction_n: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # limits of every unit, inf if none
     braking_n: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    reference: Reference | None = None
+    reference: Reference | None = None  # of all trains; None where every formation has its own
+    traffic: bool = False  # trains come and go on a net of any shape
+    cruise_mps: float | None = None  # what they drive at where nothing else holds them
 
 
 def leader(reference: Reference, time: Floats) -> tuple[Floats, Floats]:
@@ -80,6 +82,7 @@ def facts_of(scenario: Mapping[str, Any]) -> Facts:
     stated = both("", "coupler_lower_m", "coupler_upper_m")
     masses = {name: per_unit(name, "unit_mass_kg", math.nan) for name in trains}
     timing, profile = scenario.get("run", {}), scenario.get("reference")
+    traffic = "sumocfg" in scenario.get("network", {})
     start = max((float(train.get("position_m", 0.0)) for train in trains.values()), default=0.0)
     return Facts(
         law=str(controller.get("law", "")),
@@ -95,5 +98,7 @@ def facts_of(scenario: Mapping[str, Any]) -> Facts:
         length_m={name: per_unit(name, "unit_length_m", 0.0) for name in trains},
         traction_n={name: per_unit(name, "traction_n", math.inf) for name in trains},
         braking_n={name: per_unit(name, "braking_n", math.inf) for name in trains},
-        reference=Profile.model_validate(profile).leader(start) if profile else None,
+        reference=Profile.model_validate(profile).leader(start) if profile and not traffic else None,
+        traffic=traffic,
+        cruise_mps=profile.get("speed_mps") if profile and traffic else None,
     )

@@ -21,6 +21,13 @@ from trainctl.signals import Bools, Floats
 #: Events that the train graph marks.
 SHOWN_EVENTS = ("topology", "reroute", "join", "leave", "fault", "limit")
 
+#: The same where trains come and go: marks on the train's own line, and their words.
+MARKS = {
+    "couple": ("^", "couples"), "uncouple": ("v", "uncouples"), "stop_reached": ("s", "stops"),
+    "conflict": ("D", "waits for its turn"), "reroute": ("o", "new route"), "reroute_refused": ("x", "route refused"),
+    "supervisor": ("|", "supervisor acts"),
+}  # fmt: skip
+
 
 @dataclass
 class Drawn:
@@ -67,7 +74,7 @@ def positions(drawn: Drawn) -> Figure:
     reference = drawn.known.reference
     figure, axes = style.panels(1 if reference is None else 2, drawn.width)
     time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
-    inside = _in_formation(drawn)
+    inside = in_formation(drawn)
     for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
         relative = position[rows] - (0.0 if reference is None else leader(reference, time[rows])[0])
         for panel, value in zip(axes, (position[rows] / 1000, relative / 1000), strict=False):
@@ -140,6 +147,8 @@ def draw_speeds(panel: Axes, drawn: Drawn) -> None:
         instants = drawn.instants
         reference = leader(drawn.known.reference, instants)[1]
         style.draw(panel, instants, reference, color="black", linestyle=":", label="reference", zorder=3)
+    if drawn.known.cruise_mps is not None:
+        style.bound(panel, drawn.known.cruise_mps, label="cruising speed", color="black", linestyle=":")
     panel.set_ylabel("speed [m/s]")
 
 
@@ -170,7 +179,12 @@ def speeds_and_inputs(drawn: Drawn) -> Figure:
 
 
 def train_graph(drawn: Drawn) -> Figure:
-    """Time-distance diagram: one colour per train, one line style per track, switches marked, events as vertical lines."""
+    """Time-distance diagram: one colour per train, one line style per track, switches marked, events as vertical lines.
+
+    Where trains come and go, full lines are trains in formations, and marks on the lines say what happened to them.
+    """
+    if drawn.known.traffic:
+        return _coming_and_going(drawn)
     reference = drawn.known.reference
     figure, axes = style.panels(1 if reference is None else 2, drawn.width, 60.0)
     time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
@@ -216,6 +230,42 @@ def train_graph(drawn: Drawn) -> Figure:
     if happened:
         marks.append(Line2D([], [], color=style.GREY, linewidth=0.5, label="event"))
     style.legend(figure, drawn.width, [*handles, *styles, *marks])
+    return figure
+
+
+def _coming_and_going(drawn: Drawn) -> Figure:
+    """Train graph of a net of any shape: positions run on along every way, so trains of different tracks may cross in it."""
+    figure, axes = style.panels(1, drawn.width, 90.0)
+    time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m") / 1000
+    inside = in_formation(drawn)
+    rows_of = dict(drawn.trains.slices())
+    for (name, rows), label in zip(rows_of.items(), style.labels(drawn.trains.names, "train "), strict=True):
+        _in_and_out(axes[0], time[rows], position[rows], inside[rows], drawn.colour[name], label)
+    marks = []
+    for kind, (mark, words) in MARKS.items():
+        events = [e for e in drawn.run.events if e["kind"] == kind and e.get("train") in rows_of]
+        for event in events:
+            rows = rows_of[event["train"]]
+            at = float(np.interp(event["time_s"], time[rows], position[rows]))
+            axes[0].plot(
+                event["time_s"], at, linestyle="none", marker=mark, markersize=4.5, color=drawn.colour[event["train"]],
+                markeredgecolor="black", markeredgewidth=0.5, zorder=4,
+            )  # fmt: skip
+        if events:
+            marks.append(Line2D(
+                [], [], color=style.GREY, linestyle="none", marker=mark, markersize=4.5, markeredgecolor="black",
+                markeredgewidth=0.5, label=f"{words} ({len(events)})",
+            ))  # fmt: skip
+    axes[0].set_ylabel("position [km]")
+    axes[0].set_xlabel("time [s]")
+    axes[0].set_xlim(drawn.instants[0], drawn.instants[-1])
+    handles = [
+        Line2D([], [], color=drawn.colour[name], label=label)
+        for name, label in zip(drawn.trains.names, style.labels(drawn.trains.names, "train "), strict=True)
+        if not label.startswith("_")
+    ]
+    alone = [] if inside.all() else [Line2D([], [], color=style.GREY, linestyle=":", linewidth=0.7, label="in no formation")]
+    style.legend(figure, drawn.width, [*handles, *alone, *marks])
     return figure
 
 
@@ -290,9 +340,12 @@ def _distinct(ranges: Any) -> list[float]:
     return found if len(found) <= 6 else []
 
 
-def _in_formation(drawn: Drawn) -> Bools:
-    """True for rows of trains that have a link at that instant; for all rows if nobody ever has one."""
+def in_formation(drawn: Drawn) -> Bools:
+    """True for rows of trains in a formation: as logged, else where they have a link; for all rows if nobody ever has one."""
     rows = drawn.trains.frame
+    if "in_formation" in rows:
+        member: Bools = drawn.trains.column("in_formation") > 0.5
+        return member
     if not drawn.links.names:
         return np.ones(len(rows), dtype=np.bool_)
     at = np.round(drawn.links.column("time_s") / INSTANT).astype(np.int64)

@@ -38,6 +38,13 @@ FIGURES = (
 )  # fmt: skip
 
 
+#: In place of the animation.
+NO_FILM = (
+    '<p class="keys">There is no animation: a run without SUMO does not know where the tracks of its net lie. The plots below show'
+    " every train.</p>"
+)
+
+
 def report(run: Run, out: Path | str | None = None) -> Path:
     """Write the page of a run.
 
@@ -70,7 +77,9 @@ def page(run: Run) -> str:
     if not drawn.trains.names:
         raise InputError(f"{run.folder}: no train was recorded")
     values = run.metrics if (run.folder / "metrics.json").exists() else metrics(run)
-    data: dict[str, Any] = {"animation": animation(drawn), "panels": panels(drawn), "title": drawn.known.title}
+    film = animation(drawn)
+    span = [float(drawn.instants[0]), float(drawn.instants[-1])]
+    data: dict[str, Any] = {"animation": film, "panels": panels(drawn), "title": drawn.known.title, "span": span}
     parts = {
         "title": escape(drawn.known.title or run.folder.name),
         "css": _template("report.css"),
@@ -81,7 +90,10 @@ def page(run: Run) -> str:
         "verdict": _verdict(values),
         "bounds": _bounds(values),
         "figures": _figures(values),
-        "events": _events(data["animation"]),
+        "events": _events(film),
+        "tracks": "On the net" if drawn.known.traffic else "On the tracks",
+        "no_film": "" if film["time"] else NO_FILM,
+        "hidden": "" if film["time"] else "hidden",
     }
     return _filled(_template("report.html"), parts)
 

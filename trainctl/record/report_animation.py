@@ -11,6 +11,7 @@ import numpy as np
 import sumo_net
 from sumo_net import Line, LineError
 from trainctl.record.figures_trains import Drawn
+from trainctl.record.report_map import on_the_map
 from trainctl.record.report_panels import _hex, packed, told
 from trainctl.record.series import INSTANT
 from trainctl.signals import Floats
@@ -31,9 +32,12 @@ def animation(drawn: Drawn) -> dict[str, Any]:
     dict
         ``tracks`` in lateral order, ``crossovers``, ``trains`` (name, colour, length), ``time`` (frames,) [s], ``position``,
         ``lateral``, ``speed`` (frames x trains, NaN where a train is not there), ``pairs`` and their ``links`` (frames x pairs:
-        0 none, 1 stands but was not heard, 2 heard), ``events``.
+        0 none, 1 stands but was not heard, 2 heard), ``events``. For a net of any shape see ``report_map``; ``time`` is empty
+        where the run was made without SUMO, and there is nothing to draw them on.
     """
     split = drawn.trains
+    if drawn.known.traffic:
+        return _of_traffic(drawn)
     line = _line(drawn)
     categories = [str(name) for name in split.frame["track"].astype("category").cat.categories]
     tracks = list(line.track_ids) if line is not None and set(categories) <= set(line.track_ids) else categories
@@ -50,18 +54,40 @@ def animation(drawn: Drawn) -> dict[str, Any]:
     return {
         "tracks": tracks,
         "crossovers": [] if line is None else _crossovers(line, tracks, float(np.nanmin(x)), float(np.nanmax(x))),
-        "trains": [
-            {"name": name, "color": _hex(drawn.colour[name]), "length": float(sum(drawn.known.length_m.get(name, ()))) or 0.0}
-            for name in split.names
-        ],
+        "trains": _trains(drawn),
         "time": [round(float(t), 6) for t in times],
         "position": packed(position), "lateral": packed(lateral), "speed": packed(speed),
         "pairs": pairs, "links": base64.b64encode(links.tobytes()).decode(),
-        "events": [
-            {"time": event["time_s"], "kind": event["kind"], "text": told(event)} for event in drawn.run.events[:NAMED_EVENTS]
-        ],
-        "events_left_out": max(0, len(drawn.run.events) - NAMED_EVENTS),
+        **_events(drawn),
     }  # fmt: skip
+
+
+def _of_traffic(drawn: Drawn) -> dict[str, Any]:
+    """The same for trains that come and go."""
+    times = frames(drawn.instants, [float(event["time_s"]) for event in drawn.run.events], len(drawn.trains.names))
+    where = on_the_map(drawn, times)
+    if where is None:
+        where, times = {"tracks": []}, times[:0]
+    pairs, links = _links(drawn, times) if len(times) else ([], np.zeros((0, 0), np.uint8))
+    return {
+        "crossovers": [], "trains": _trains(drawn), "time": [round(float(t), 6) for t in times],
+        "pairs": pairs, "links": base64.b64encode(links.tobytes()).decode(), **where, **_events(drawn),
+    }  # fmt: skip
+
+
+def _trains(drawn: Drawn) -> list[dict[str, Any]]:
+    return [
+        {"name": name, "color": _hex(drawn.colour[name]), "length": float(sum(drawn.known.length_m.get(name, ()))) or 0.0}
+        for name in drawn.trains.names
+    ]
+
+
+def _events(drawn: Drawn) -> dict[str, Any]:
+    events = drawn.run.events
+    return {
+        "events": [{"time": event["time_s"], "kind": event["kind"], "text": told(event)} for event in events[:NAMED_EVENTS]],
+        "events_left_out": max(0, len(events) - NAMED_EVENTS),
+    }
 
 
 def frames(instants: Floats, events: Sequence[float], trains: int) -> Floats:

@@ -14,7 +14,7 @@ import numpy as np
 
 from trainctl.record import style
 from trainctl.record.facts import leader
-from trainctl.record.figures_trains import Drawn
+from trainctl.record.figures_trains import Drawn, in_formation
 from trainctl.record.motion import JOULES_PER_KWH
 from trainctl.record.series import INSTANT
 from trainctl.record.values import at_least, at_most
@@ -80,6 +80,9 @@ def _reference(drawn: Drawn, value: Floats) -> Trace:
 def _train_graph(drawn: Drawn) -> Iterator[Panel]:
     """Time against distance, one dash per track; below, relative to the reference."""
     time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
+    if drawn.known.traffic:
+        yield panel("graph", "Train graph", "position [km]", list(_in_and_out(drawn, position / 1000)), note=IN_AND_OUT)
+        return
     track = drawn.trains.frame["track"]
     lateral = [str(name) for name in track.astype("category").cat.categories]
     on = track.astype(str).to_numpy()
@@ -108,12 +111,35 @@ def _train_graph(drawn: Drawn) -> Iterator[Panel]:
         yield panel(name, title, unit, traces, note="One colour per train, one dash per track." if name == "graph" else "")
 
 
+#: Of panels of trains that come and go.
+IN_AND_OUT = "Full where the train is in a formation, dotted where it is not; no line where it is not there."
+
+
+def _in_and_out(drawn: Drawn, value: Floats) -> Iterator[Trace]:
+    """A full line for the train in formations, a dotted one for the train alone."""
+    time, inside = drawn.trains.column("time_s"), in_formation(drawn)
+    for name, rows in drawn.trains.slices():
+        inner = inside[rows]
+        outer: Bools = ~inner
+        outer[1:] |= outer[:-1] & inner[1:]  # up to the first row in the formation: the line has no hole
+        for here, dash, words in ((inner, "solid", ""), (outer, "2px,3px", ", in no formation")):
+            if here.any():
+                yield _line(
+                    time[rows], np.where(here, value[rows], np.nan), f"train {name}{words}", _colour(drawn, name),
+                    len(drawn.trains.names), dash=dash, group=name,
+                )  # fmt: skip
+
+
 def _speeds(drawn: Drawn) -> Panel:
-    traces = _of_trains(drawn, drawn.trains.column("speed_mps"))
+    speed = drawn.trains.column("speed_mps")
+    traces = list(_in_and_out(drawn, speed)) if drawn.known.traffic else _of_trains(drawn, speed)
     if drawn.known.reference is not None:
         traces.append(_reference(drawn, leader(drawn.known.reference, drawn.instants)[1]))
     bounds = _limits(value for pair in drawn.known.speed_mps.values() for value in pair)
-    return panel("speeds", "Speeds against bounds", "speed [m/s]", traces, bounds=bounds)
+    if drawn.known.cruise_mps is not None:
+        bounds.append({"value": drawn.known.cruise_mps, "name": "cruising speed", "dash": "dot"})
+    note = f"{IN_AND_OUT} Bounds are those of trains in formations." if drawn.known.traffic else ""
+    return panel("speeds", "Speeds against bounds", "speed [m/s]", traces, bounds=bounds, note=note)
 
 
 def _inputs(drawn: Drawn) -> Panel:

@@ -80,7 +80,7 @@ def _order(handle: Any) -> list[tuple[int, int, str]]:
     """Lines by name, numbers by size, then what belongs to all lines."""
     label = str(handle.get_label())
     parts = re.findall(r"\d+|\D+", label)
-    common = label in ("desired", "reference", "bound", "limit", "least allowed")
+    common = label in ("desired", "reference", "cruising speed", "bound", "limit", "least allowed")
     return [(int(common), 0, ""), *((0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts)]
 
 

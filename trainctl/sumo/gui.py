@@ -3,7 +3,7 @@
 Real tracks lie 4.5 m apart and trains kilometres: at a scale that shows a formation the net is one line. So the picture repeats
 the tracks farther apart, with a dot for every train, coloured by its role, and an arc for every link: above for what a train
 hears from ahead, below for what it hears from behind. It stands on the kilometrage, above the net; zoom in on the net to see the
-trains themselves, which have the same colours.
+trains themselves, which have the same colours. A net of any shape (``Map``) has no such picture: dots and links lie on it.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -84,20 +85,22 @@ class Gui(Sumo):
 
     def start(self, start: Start) -> None:
         """As in ``Sumo``; then the picture."""
-        seen = start.lane_position + self.line.start_m[start.edge]
-        length = max(float(np.ptp(seen)), 2000.0)
-        self.spread, self.width = 0.06 * length, 1.5 * length
+        self._scale(start)
         (self.folder / "view.xml").write_text(VIEW.format(delay_ms=self.delay_ms), encoding="utf-8")
         (self.folder / "picture.add.xml").write_text(self._tracks(), encoding="utf-8")
         super().start(start)
-        for i, name in enumerate(self.ids):
-            x, y = self._place(i)
-            traci.poi.add(f"train_{name}", x, y + 0.3 * self.spread, color=ALONE, poiType="train", layer=300)
-            traci.polygon.add(f"dot_{name}", self._dot(x, y), ALONE, fill=True, polygonType="train", layer=300)
+        self.colours, self.dots = [ALONE] * len(self.ids), set[int]()
+        self._call(self._draw)
         if self.window:
             x, y = self._middle()
             traci.gui.setSchema(traci.gui.DEFAULT_VIEW, "trainctl")
             traci.gui.setBoundary(traci.gui.DEFAULT_VIEW, x - self.width / 2, y, x + self.width / 2, y)
+
+    def _scale(self, start: Start) -> None:
+        """Distance of the tracks of the picture, and width of what the window shows [m]."""
+        seen = start.lane_position + self.line.start_m[start.edge]
+        length = max(float(np.ptp(seen)), 2000.0)
+        self.spread, self.width = 0.06 * length, 1.5 * length
 
     def _ready(self) -> None:
         if traci.isLoaded():
@@ -135,10 +138,10 @@ class Gui(Sumo):
         first = np.empty(len(order), bool)
         first[order] = leads
         hears = np.diff(links.first) > 0
-        for i, name in enumerate(self.ids):
-            colour = ALONE if not hears[i] else FIRST if first[i] else MEMBER
-            traci.vehicle.setColor(name, colour)
-            traci.polygon.setColor(f"dot_{name}", colour)
+        self.colours = [ALONE if not hears[i] else FIRST if first[i] else MEMBER for i in range(len(order))]
+        for i in self.dots:
+            traci.vehicle.setColor(self.ids[i], self.colours[i])
+            traci.polygon.setColor(f"dot_{self.ids[i]}", self.colours[i])
         for arc in self.shown:
             traci.polygon.remove(arc)
         self.shown = set()
@@ -165,13 +168,26 @@ class Gui(Sumo):
             return
 
     def _draw(self) -> None:
-        places = [self._place(i) for i in range(len(self.ids))]
-        for name, (x, y) in zip(self.ids, places, strict=True):
-            traci.poi.setPosition(f"train_{name}", x, y + 0.3 * self.spread)
-            traci.polygon.setShape(f"dot_{name}", self._dot(x, y))
+        places = {i: self._place(i) for i in np.flatnonzero(self.seen.present).tolist()}
+        for i in self.dots - set(places):
+            traci.poi.remove(f"train_{self.ids[i]}")
+            traci.polygon.remove(f"dot_{self.ids[i]}")
+        for i, (x, y) in places.items():
+            name = self.ids[i]
+            if i in self.dots:
+                traci.poi.setPosition(f"train_{name}", x, y + 0.3 * self.spread)
+                traci.polygon.setShape(f"dot_{name}", self._dot(x, y))
+            else:
+                traci.poi.add(f"train_{name}", x, y + 0.3 * self.spread, color=ALONE, poiType="train", layer=300)
+                traci.polygon.add(f"dot_{name}", self._dot(x, y), self.colours[i], fill=True, polygonType="train", layer=300)
+                if self.links is not None:
+                    traci.vehicle.setColor(name, self.colours[i])
+        self.dots = set(places)
         if self.links is not None:
             for sender, receiver, heard in zip(*(x.tolist() for x in (self.links.sender, self.links.receiver, self.links.heard)),
                                                strict=True):  # fmt: skip
+                if not {sender, receiver} <= self.dots:
+                    continue
                 self._arc(f"link_{self.ids[sender]}_{self.ids[receiver]}", places[sender], places[receiver], heard)
         if self.window:
             traci.gui.setOffset(traci.gui.DEFAULT_VIEW, *self._middle())
@@ -224,3 +240,24 @@ class Gui(Sumo):
             for name, a, b, t, u in ways
         ]
         return "<additional>\n" + "".join(rows) + "</additional>\n"
+
+
+class Map(Gui):
+    """The same for a net of any shape: dots and links lie on the net itself, and trains come and go."""
+
+    def _scale(self, start: Start) -> None:
+        location = next(e for _, e in ElementTree.iterparse(self.net) if e.tag == "location")
+        x0, y0, x1, y1 = (float(part) for part in location.get("convBoundary", "0,0,1000,1000").split(","))
+        self.centre, self.width = ((x0 + x1) / 2, (y0 + y1) / 2), 1.1 * max(x1 - x0, y1 - y0, 1000.0)
+        self.spread = 0.04 * self.width
+
+    def _place(self, i: int) -> tuple[float, float]:
+        x, y = traci.vehicle.getPosition(self.ids[i])
+        return float(x), float(y)
+
+    def _middle(self) -> tuple[float, float]:
+        return self.centre
+
+    def _tracks(self) -> str:
+        """The net is there already."""
+        return "<additional/>\n"

@@ -8,7 +8,7 @@
 
   // ---- plots -------------------------------------------------------------------------------------------------------------------
   const plots = [];
-  const whole = [data.animation.time[0], data.animation.time[data.animation.time.length - 1]];
+  const whole = data.span;
   let range = whole.slice();
   const isDark = () => {
     const stated = document.documentElement.dataset.theme;
@@ -38,7 +38,7 @@
     if (panel.log) Object.assign(y, { type: "log", range: panel.log });
     if (panel.categories) Object.assign(y, { type: "category", title: undefined });
     return {
-      height: panel.categories ? 110 + 30 * panel.traces.length : 320, margin: { l: 92, r: 176, t: 30, b: 40 }, modebar: { bgcolor: "rgba(0,0,0,0)", color: soft, activecolor: css("--accent") }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+      height: panel.categories ? 110 + 30 * panel.traces.length : 320, margin: { l: panel.categories ? 132 : 92, r: 176, t: 30, b: 40 }, modebar: { bgcolor: "rgba(0,0,0,0)", color: soft, activecolor: css("--accent") }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
       font: { color: css("--ink"), size: 12, family: "system-ui, DejaVu Sans, sans-serif" }, hovermode: panel.categories ? "closest" : "x unified",
       hoverlabel: { bgcolor: css("--paper"), bordercolor: grid, font: { color: css("--ink") } }, legend: { font: { size: 11 }, itemsizing: "constant", traceorder: "grouped", tracegroupgap: 4 },
       showlegend: !panel.categories, xaxis: { ...axis, title: { text: "time [s]", standoff: 4 }, range: range.slice(), hoverformat: ".6~g" }, yaxis: y, dragmode: "zoom",
@@ -121,10 +121,12 @@
 
   // ---- tracks ------------------------------------------------------------------------------------------------------------------
   const film = data.animation, times = film.time, count = film.trains.length, couples = film.pairs.length;
-  const position = floats(film.position), lateral = floats(film.lateral), speed = floats(film.speed), links = bytes(film.links);
+  const filmed = times.length > 0, none = { bdata: "" };
+  const position = floats(film.position || none), lateral = floats(film.lateral || none), speed = floats(film.speed || none), links = bytes(film.links);
+  const map = film.map ? film.map.map(floats) : null, edges_of = film.edge ? floats(film.edge) : null;
   const canvas = at("view"), pen = canvas.getContext("2d"), slider = at("slider");
-  let frame = 0, now = times[0], playing = false, last = 0;
-  const height = 72 + 46 * Math.max(film.tracks.length, 1);
+  let frame = 0, now = whole[0], playing = false, last = 0;
+  const height = map ? 460 : 72 + 46 * Math.max(film.tracks.length, 1);
   slider.max = times.length - 1;
   film.trains.forEach((train, k) => at("follow").add(new Option("train " + train.name, k)));
 
@@ -144,6 +146,49 @@
     return { x: blend(position), side: blend(lateral), v: speed[a] };
   }
 
+  // a net of any shape: true to scale, unless it is so long and flat that nothing could be told apart
+  const box = map ? [0, 1].map((d) => { let low = Infinity, high = -Infinity; for (const v of map[d]) { if (v < low) low = v; if (v > high) high = v; } return [low, high]; }) : null;
+  function paint_map(share, width) {
+    const here = film.trains.map((_, k) => place(k, share)), chosen = +at("follow").value, zoom = Math.pow(2, +at("zoom").value);
+    const spans = box.map(([low, high]) => Math.max(high - low, 100)), margin = 60;
+    const across = (width - 2 * margin) / spans[0], up = (height - 2 * margin) / spans[1];
+    const base = Math.min(across, up), raised = Math.min(up, 8 * across) > base * 1.5 ? Math.min(up, 8 * across) / base : 1;
+    const sx = zoom * base, sy = zoom * base * raised;
+    const mid = chosen >= 0 && here[chosen] ? [here[chosen].x, here[chosen].side] : box.map(([low, high]) => (low + high) / 2);
+    const px = (x) => width / 2 + sx * (x - mid[0]), py = (y) => height / 2 - sy * (y - mid[1]);
+    pen.font = "12px system-ui, DejaVu Sans, sans-serif"; pen.textBaseline = "middle"; pen.lineJoin = "round";
+    pen.strokeStyle = css("--track"); pen.lineWidth = 2; pen.beginPath();
+    for (let k = 0, move = true; k < map[0].length; k++) {
+      if (Number.isNaN(map[0][k])) { move = true; continue; }
+      if (move) pen.moveTo(px(map[0][k]), py(map[1][k])); else pen.lineTo(px(map[0][k]), py(map[1][k]));
+      move = false;
+    }
+    pen.stroke();
+    pen.strokeStyle = css("--accent");
+    for (let c = 0; c < couples; c++) {
+      const state = links[frame * couples + c], a = here[film.pairs[c][0]], b = here[film.pairs[c][1]];
+      if (!state || !a || !b) continue;
+      const ax = px(a.x), ay = py(a.side), bx = px(b.x), by = py(b.side), rise = Math.min(30, 6 + Math.hypot(ax - bx, ay - by) / 6);
+      pen.lineWidth = 1.6; pen.setLineDash(state === 2 ? [] : [4, 4]);
+      pen.beginPath(); pen.moveTo(ax, ay); pen.quadraticCurveTo((ax + bx) / 2, (ay + by) / 2 - rise, bx, by); pen.stroke(); pen.setLineDash([]);
+    }
+    here.forEach((p, k) => {
+      if (!p) return;
+      const x = px(p.x), y = py(p.side);
+      pen.fillStyle = shown(film.trains[k].color); pen.strokeStyle = css("--panel"); pen.lineWidth = 1.5;
+      pen.beginPath(); pen.arc(x, y, 7, 0, 7); pen.fill(); pen.stroke();
+      if (count <= 30 || zoom > 4) {
+        pen.fillStyle = css("--ink"); pen.font = "bold 12px system-ui, DejaVu Sans, sans-serif"; pen.textAlign = "left"; pen.fillText(film.trains[k].name, x + 9, y + (k % 2 ? 14 : -12));
+      }
+    });
+    let step = Math.pow(10, Math.floor(Math.log10(width / sx / 4)));
+    step *= width / sx / step > 20 ? 5 : width / sx / step > 8 ? 2 : 1;
+    const soft = css("--soft"); pen.strokeStyle = soft; pen.fillStyle = soft; pen.lineWidth = 2; pen.textAlign = "left"; pen.font = "12px system-ui, DejaVu Sans, sans-serif";
+    pen.beginPath(); pen.moveTo(14, height - 16); pen.lineTo(14 + step * sx, height - 16); pen.stroke();
+    pen.fillText((step >= 1000 ? step / 1000 + " km" : step + " m") + (raised > 1 ? `, northwards drawn ${raised.toFixed(1)} times as large` : ""), 22 + step * sx, height - 16);
+    pen.fillStyle = css("--ink"); pen.font = "bold 13px system-ui, DejaVu Sans, sans-serif"; pen.fillText("t = " + +now.toFixed(3) + " s", 8, 16);
+  }
+
   function paint(share) {
     const ratio = devicePixelRatio || 1, width = canvas.clientWidth;
     if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
@@ -151,6 +196,7 @@
     }
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.clearRect(0, 0, width, height);
+    if (map) { paint_map(share, width); return; }
     const here = film.trains.map((_, k) => place(k, share));
     const present = here.filter((p) => p);
     if (!present.length) return;
@@ -221,7 +267,8 @@
     const words = [], edges = [], silent = [];
     for (let k = 0; k < count; k++) {
       const p = place(k, 0);
-      if (p) words.push(`${film.trains[k].name}: ${Number.isInteger(p.side) ? "track " + film.tracks[p.side] : "crossover to track " + film.tracks[p.side > nearest(k) ? Math.ceil(p.side) : Math.floor(p.side)]}, ${(p.x / 1000).toFixed(3)} km, ${p.v.toFixed(2)} m/s`);
+      if (p && map) words.push(`${film.trains[k].name}: ${film.tracks[edges_of[frame * count + k]]}, ${p.v.toFixed(2)} m/s`);
+      else if (p) words.push(`${film.trains[k].name}: ${Number.isInteger(p.side) ? "track " + film.tracks[p.side] : "crossover to track " + film.tracks[p.side > nearest(k) ? Math.ceil(p.side) : Math.floor(p.side)]}, ${(p.x / 1000).toFixed(3)} km, ${p.v.toFixed(2)} m/s`);
     }
     for (let c = 0; c < couples; c++) {
       const state = links[frame * couples + c], [a, b] = film.pairs[c];
@@ -241,6 +288,7 @@
   }
 
   function show(wanted) {
+    if (!filmed) { cursors(); return; }
     frame = Math.max(0, Math.min(times.length - 1, wanted)); now = times[frame];
     slider.value = frame; slider.setAttribute("aria-valuetext", +now.toFixed(3) + " s"); at("clock").textContent = +now.toFixed(3) + " s";
     paint(0); tell(); cursors();
@@ -250,7 +298,10 @@
     while (low < high) { const middle = (low + high + 1) >> 1; if (times[middle] <= time + 1e-6) low = middle; else high = middle - 1; }
     return low;
   }
-  function go_to_time(time) { pause(); show(frame_of(time)); }
+  function go_to_time(time) {
+    pause();
+    if (filmed) show(frame_of(time)); else { now = time; cursors(); }
+  }
   function tick(stamp) {
     if (!playing) return;
     now += Math.min(stamp - last, 100) / 1000 * +at("rate").value; last = stamp;
@@ -267,7 +318,7 @@
     if (frame === times.length - 1) show(0);
     playing = true; at("play").textContent = "Pause"; at("play").setAttribute("aria-pressed", "true"); last = performance.now(); requestAnimationFrame(tick);
   }
-  const toggle = () => { if (playing) { pause(); show(frame); } else play(); };
+  const toggle = () => { if (!filmed) return; if (playing) { pause(); show(frame); } else play(); };
   const moments = [...new Set(film.events.map((e) => e.time))].sort((a, b) => a - b);
   const next_event = (sign) => { const ahead = moments.filter((t) => sign * (t - times[frame]) > 1e-6); if (ahead.length) go_to_time(sign > 0 ? ahead[0] : ahead[ahead.length - 1]); };
 
@@ -286,10 +337,10 @@
   });
 
   // ---- light and dark, address, start ------------------------------------------------------------------------------------------
-  function recolour() { paint(0); return redraw().then(cursors); }
+  function recolour() { if (filmed) paint(0); return redraw().then(cursors); }
   at("theme").addEventListener("click", () => { document.documentElement.dataset.theme = isDark() ? "light" : "dark"; recolour(); });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolour);
-  addEventListener("resize", () => { paint(0); setTimeout(cursors, 300); });
+  addEventListener("resize", () => { if (filmed) paint(0); setTimeout(cursors, 300); });
   const from_address = () => { const wanted = /^#t=([\d.]+)$/.exec(location.hash); if (wanted) go_to_time(+wanted[1]); };
   addEventListener("hashchange", from_address);
   show(0);
