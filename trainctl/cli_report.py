@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from trainctl.record.run import Run
 
 
+CAPACITY = "compare capacity"
+
+
 def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
     app.command()(report)
@@ -32,19 +35,41 @@ def report(
 
 
 def compare(
-    names: Annotated[list[str], typer.Argument(metavar="RUN...", help="Run folders; with --controllers all one scenario.")],
+    names: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="RUN...",
+            help="Run folders; with --controllers all one scenario; or the word capacity (./capacity is a folder).",
+        ),
+    ],
     controllers: Annotated[
         Literal["all"] | None, typer.Option(help="all: run the scenario under every law that can drive its traffic, and compare.")
     ] = None,
-    out: Annotated[Path, typer.Option(help="Where the figures (and with --controllers the runs) go.")] = Path("runs/compare"),
+    out: Annotated[
+        Path | None, typer.Option(help="Where figures and runs go; default runs/compare, with capacity runs/capacity.")
+    ] = None,
     backend: Annotated[Literal["sumo", "numeric"], typer.Option(help="With --controllers: SUMO, or the loop without it.")] = "sumo",
     formats: Annotated[list[str] | None, typer.Option("--format", help="png, svg, pdf; repeatable; default png.")] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="With --controllers: override a key of the scenario.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")] = False,
+    trains: Annotated[int | None, typer.Option(help="Trains; default 40.", rich_help_panel=CAPACITY)] = None,
+    length_km: Annotated[float | None, typer.Option(help="Measured stretch [km]; default 100.", rich_help_panel=CAPACITY)] = None,
+    speed_mps: Annotated[float | None, typer.Option(help="Line speed [m/s]; default 83.333.", rich_help_panel=CAPACITY)] = None,
+    signals_m: Annotated[float | None, typer.Option(help="Blocks [m]; default 2000.", rich_help_panel=CAPACITY)] = None,
+    spacing_m: Annotated[
+        float | None, typer.Option(help="Desired spacing of the formations [m]; default 3000.", rich_help_panel=CAPACITY)
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Runs at a time; default one per core.", rich_help_panel=CAPACITY)
+    ] = None,
 ) -> None:
-    """Compare runs: one table, figures side by side."""
+    """Compare runs: one table, figures side by side.
+
+    `trainctl compare capacity` runs the same trains on the same line under SUMO's fixed block and moving block and under every law:
+    headway, trains per hour, journey time, energy, collisions.
+    """
     from trainctl.cli import _print, _print_json, _table
     from trainctl.record import compare as comparing
     from trainctl.record.run import Run
@@ -53,6 +78,19 @@ def compare(
     wrong = [f for f in wanted if f not in ("png", "svg", "pdf")]
     if wrong:
         raise InputError([f"--format {f}: must be one of png, svg, pdf" for f in wrong])
+    plan = {
+        "trains": trains, "length_m": None if length_km is None else 1000.0 * length_km, "speed_mps": speed_mps,
+        "signals_m": signals_m, "spacing_m": spacing_m,
+    }  # fmt: skip
+    if names == ["capacity"] and controllers is None:
+        chosen = {key: value for key, value in plan.items() if value is not None}
+        _capacity(chosen, out or Path("runs/capacity"), wanted, workers, as_json)
+        return
+    given = {"workers": workers, "trains": trains, "length-km": length_km, "speed-mps": speed_mps, "signals-m": signals_m}
+    given["spacing-m"] = spacing_m
+    if idle := [f"--{key}: only with `trainctl compare capacity`" for key, value in given.items() if value is not None]:
+        raise InputError(idle)
+    out = out or Path("runs/compare")
     left_out: dict[str, list[str]] = {}
     if controllers is None:
         if settings:
@@ -79,6 +117,36 @@ def compare(
         print(path)
 
 
+def _capacity(given: dict[str, Any], out: Path, formats: tuple[str, ...], workers: int | None, as_json: bool) -> None:
+    """Run, measure and show how much a line carries; rows that failed are told and make the exit code 3."""
+    import sys
+
+    from rich.markup import escape
+
+    from trainctl import capacity
+    from trainctl.cli import _print, _print_json, _progress, _table
+
+    plan = capacity.Plan(**given)
+    with _progress("capacity", sys.stderr.isatty()) as advance:
+        table = capacity.compare(plan, out, workers=workers, progress=advance)
+    pictures = capacity.figure(table, plan, out / "capacity", formats)
+    if as_json:
+        _print_json(table)
+    else:
+        km, kmh = plan.length_m / 1000.0, 3.6 * plan.speed_mps
+        shown = _table(f"{plan.trains} trains over {km:g} km at {kmh:.3g} km/h at most", *map(escape, capacity.COLUMNS))
+        for row in table:
+            shown.add_row(row["row"].replace("_", " "), *(_shown(row[key]) for key in list(capacity.COLUMNS.values())[1:]))
+        _print(shown)
+        for path in pictures:
+            print(path)
+    failed = [f"{row['row']}: {row['error']}" for row in table if row["error"]]
+    for line in failed:
+        print(line, file=sys.stderr)
+    if failed:
+        raise typer.Exit(3)
+
+
 def _under_all(
     name: str, out: Path, backend: Literal["sumo", "numeric"], settings: list[str] | None
 ) -> tuple[list[Run], list[str], dict[str, list[str]]]:
@@ -94,8 +162,7 @@ def _under_all(
 
     data, path = read(name, dict(map(_setting, settings or [])))
     runs, labels, left_out = [], [], {}
-    there = laws()
-    for law, changed in comparing.alternatives(data, there).items():
+    for law, changed in comparing.alternatives(data, laws()).items():
         try:
             scenario, found = examine(changed)
             if scenario is None:
@@ -108,8 +175,6 @@ def _under_all(
             left_out[law] = list(error.mistakes)
         except TrainctlError as error:
             left_out[law] = [f"the run failed: {error}"]
-    if "sumo" not in there:
-        left_out["sumo"] = ["there is no controller sumo"]
     if not runs:
         raise InputError([f"{law}: {reason}" for law, reasons in left_out.items() for reason in reasons])
     return runs, labels, left_out

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from sumo_net.build import netconvert
-from trainctl import runner
+from trainctl import capacity, runner
 from trainctl.errors import InputError
 from trainctl.prepare import open_scenario
 from trainctl.reading import examine
@@ -59,27 +59,27 @@ def passages(frame: Any, at: float) -> np.ndarray:
     return np.sort(found)
 
 
-def without_us(folder: Path, net: Path, moving: bool, trains: int = 6) -> np.ndarray:
+def without_us(
+    folder: Path, net: Path, moving: bool, trains: int = 6, entry: float = 1000.0, section: float = SECTION, until: int = 1500
+) -> np.ndarray:
     """Passages at the section as a detector of SUMO's sees them, with routes of this test's own."""
     edges = [e.get("id") for e in ElementTree.parse(net).iter("edge") if e.get("function") != "internal"]
     edges.sort(key=lambda name: float(str(name).partition("_")[2]))
-    on = next(e for e in reversed(edges) if float(e.partition("_")[2]) < SECTION)
-    first = next(e for e in reversed(edges) if float(e.partition("_")[2]) <= 1000.0)
+    on = next(e for e in reversed(edges) if float(e.partition("_")[2]) < section)
+    first = next(e for e in reversed(edges) if float(e.partition("_")[2]) <= entry)
+    at = entry - float(first.partition("_")[2])
     (folder / "own.rou.xml").write_text(
         '<routes><vType id="t" vClass="rail" carFollowModel="Rail" trainType="ICE3" maxSpeed="83.333" speedFactor="1" speedDev="0"/>'
         f'<route id="r" edges="{" ".join(edges[edges.index(first) :])}"/>'
-        + "".join(
-            f'<vehicle id="v{k}" type="t" route="r" depart="0" departPos="{1000 - float(first.partition("_")[2])}"/>'
-            for k in range(trains)
-        )
+        + "".join(f'<vehicle id="v{k}" type="t" route="r" depart="0" departPos="{at}"/>' for k in range(trains))
         + "</routes>"
     )
-    at = SECTION - float(on.partition("_")[2])
+    at = section - float(on.partition("_")[2])
     (folder / "own.add.xml").write_text(
         f'<additional><instantInductionLoop id="d" lane="{on}_0" pos="{at}" file="own.det.xml"/></additional>'
     )
     program, environment = netconvert()
-    command = [str(program.parent / "sumo"), "-n", str(net), "-r", "own.rou.xml", "-a", "own.add.xml", "-e", "1500"]
+    command = [str(program.parent / "sumo"), "-n", str(net), "-r", "own.rou.xml", "-a", "own.add.xml", "-e", str(until)]
     command += ["--time-to-teleport", "-1", "--no-step-log", "--no-warnings", "--default.speeddev", "0", "--no-internal-links"]
     subprocess.run([*command, *(["--railsignal-moving-block"] if moving else [])], cwd=folder, env=environment, check=True)
     events = ElementTree.parse(folder / "own.det.xml").iter("instantOut")
@@ -93,6 +93,19 @@ def test_headways_are_those_of_sumo_without_us(tmp_path: Path, block: str, signa
     assert len(ours) == len(theirs) == 6
     print(block, signals_m, np.diff(ours).round(2), np.diff(theirs).round(2))
     np.testing.assert_allclose(np.diff(ours), np.diff(theirs), atol=1.0)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("block", ["fixed", "moving"])
+def test_the_rows_of_the_capacity_table_are_those_of_sumo_without_us(tmp_path: Path, block: str) -> None:
+    plan, row = capacity.Plan(), f"{block}_block"
+    capacity.prepare_files(plan, tmp_path, [row])
+    ours = capacity.one(tmp_path / f"{row}.toml", tmp_path / row, plan)
+    net = tmp_path / row / "sumo" / "capacity.net.xml"
+    theirs = np.diff(without_us(tmp_path, net, block == "moving", plan.trains, plan.begin_m, plan.end_m, 10_000))
+    print(row, ours["headway_s"], np.median(theirs), ours["headway_mean_s"], theirs.mean())
+    assert len(theirs) == plan.trains - 1
+    assert abs(ours["headway_s"] - np.median(theirs)) < 1.0 and abs(ours["headway_mean_s"] - theirs.mean()) < 1.0
 
 
 def test_a_block_holds_one_train_and_moving_block_does_not(tmp_path: Path) -> None:
@@ -144,6 +157,13 @@ def test_the_shipped_traffic_runs_under_sumo_and_its_record_is_read(tmp_path: Pa
     assert len(plot(done, tmp_path / "figures", ("png",), "double")) >= 2
 
 
+def test_trains_enter_when_and_how_they_are_told(tmp_path: Path) -> None:
+    path = scenario(tmp_path, trains=3, block="moving", entry_speed_mps=60.0, entry_every_s=150.0)
+    entered = [e for e in run(path, tmp_path / "run").events if e["kind"] == "enter"]
+    told = {"kind": "enter", "track": "1", "position_m": 1000.0, "speed_mps": 60.0}
+    assert entered == [{"time_s": 150.0 * k, "train": str(k + 1), **told} for k in range(3)]
+
+
 def test_trains_that_find_no_place_are_told(tmp_path: Path) -> None:
     done = run(scenario(tmp_path, signals_m=20000.0), tmp_path / "run", **{"run.duration_s": 60.0})
     assert [e["trains"] for e in done.events if e["kind"] == "not_entered"] == [["2", "3", "4", "5", "6"]]
@@ -154,6 +174,7 @@ def test_trains_that_find_no_place_are_told(tmp_path: Path) -> None:
     [
         ({"entry_m": 31000.0}, "controller.entry_m = 31000: off the line, 0 .. 30000 m"),
         ({"entry_m": None, "entry_speed_mps": 5.0}, "controller.entry_speed_mps = 5: only with entry_m"),
+        ({"entry_m": None, "entry_every_s": 5.0}, "controller.entry_every_s = 5: only with entry_m"),
         ({"block": "half"}, "controller.block = half: input should be 'fixed' or 'moving'"),
         ({"train_type": "TGV"}, "controller.train_type = TGV: input should be 'Freight'"),
         ({"signals_m": 30000.0}, "controller.signals_m = 30000.0: input should be less than or equal to 20000"),

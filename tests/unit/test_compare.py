@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from trainctl.cli import app
 from trainctl.prepare import laws, prepare
 from trainctl.reading import examine, find, read
+from trainctl.record import compare
 from trainctl.record.compare import PANELS, alternatives, figures, names, table
 
 
@@ -43,7 +44,7 @@ def test_every_law_can_be_put_in_front_of_three_tracks():
     data, path = read("three_tracks")
     found = alternatives(data, laws())
     assert list(found)[:5] == ["fully_distributed", "robust_constrained", "emu_finite_time", "ordinary_consensus", "fault_tolerant"]
-    assert ("sumo" in found) == ("sumo" in laws())
+    assert list(found)[5:] == ["sumo_fixed_block", "sumo_moving_block"]
     assert found["fully_distributed"] == data
     for name, changed in found.items():
         assert [changed[key] for key in ("train", "event", "network", "reference", "bounds", "link")] == [
@@ -53,6 +54,10 @@ def test_every_law_can_be_put_in_front_of_three_tracks():
         assert mistakes == [], name
         prepare(scenario, path.name, path.parent)
     assert found["ordinary_consensus"]["controller"]["alpha_1"] == 1.0
+    assert found["sumo_moving_block"]["controller"] == {"law": "sumo", "block": "moving"}
+    moving = {**data, "controller": {"law": "sumo", "block": "moving", "signals_m": 1000.0}}
+    assert alternatives(moving, laws())["sumo_moving_block"] == moving
+    assert alternatives(moving, laws())["sumo_fixed_block"]["controller"] == {"law": "sumo", "block": "fixed"}
 
 
 def test_laws_that_cannot_drive_the_traffic_are_named_with_the_reason(tmp_path):
@@ -71,5 +76,18 @@ def test_laws_that_cannot_drive_the_traffic_are_named_with_the_reason(tmp_path):
     told = json.loads(done.stdout)
     assert {"fully_distributed", "robust_constrained"} <= set(told["runs"])
     assert any("runs on coupled_units" in reason for reason in told["left_out"]["emu_finite_time"])
+    assert any("SUMO drives by itself" in reason for reason in told["left_out"]["sumo_fixed_block"])
     assert (tmp_path / "fully_distributed" / "run.json").is_file()
     assert (tmp_path / "compare_speeds.png").is_file()
+
+
+def test_sumos_own_trains_are_rows_of_the_comparison(tmp_path, monkeypatch):
+    few = {name: law for name, law in compare.LAWS.items() if law in ("sumo", "fully_distributed")}
+    monkeypatch.setattr(compare, "LAWS", few)
+    typed = ["compare", "three_tracks", "--controllers", "all", "--set", "run.duration_s=40", "--json", "--out", str(tmp_path)]
+    done = CliRunner().invoke(app, typed, catch_exceptions=False)
+    told = json.loads(done.stdout)
+    assert told["runs"] == ["fully_distributed", "sumo_fixed_block", "sumo_moving_block"] and told["left_out"] == {}
+    rows = {row["metric"]: row["values"] for row in told["rows"]}
+    assert rows["energy.traction_kwh"][2] > 0.0
+    assert [value is None for value in rows["formation.final_error_m"]] == [False, True, True]

@@ -52,8 +52,9 @@ class Params(Table):
         "lets them; default: at time 0 every train is where its [[train]] table says.",
     )  # fmt: skip
     entry_speed_mps: float | None = Field(
-        None, ge=0, description="With entry_m: speed at which they enter [m/s]; default SUMO's choice, as fast as is safe."
+        None, ge=0, description="With entry_m: speed at which they enter [m/s]; default as fast as SUMO takes for safe."
     )
+    entry_every_s: float = Field(0.0, ge=0, description="With entry_m: the k-th train does not enter before k times this [s].")
 
 
 def violations(params: Params, scene: Scene) -> list[str]:
@@ -61,6 +62,8 @@ def violations(params: Params, scene: Scene) -> list[str]:
     found = []
     if params.entry_m is None and params.entry_speed_mps is not None:
         found.append(f"controller.entry_speed_mps = {params.entry_speed_mps:g}: only with entry_m")
+    if params.entry_m is None and params.entry_every_s > 0.0:
+        found.append(f"controller.entry_every_s = {params.entry_every_s:g}: only with entry_m")
     return found
 
 

@@ -115,6 +115,8 @@ def _errors(axes: Axes, drawn: Drawn) -> None:
         style.draw(
             axes, links.column("time_s")[rows], np.abs(links.column("error_m")[rows]).clip(1e-4), color=colour, label=f"link {name}"
         )
+    if not links.names:
+        axes.text(0.5, 0.5, "no links", transform=axes.transAxes, ha="center", color=style.GREY)
     axes.set_ylabel(r"$|x_{ij} - d_{ij}|$ [m]")
 
 
@@ -127,8 +129,12 @@ PANELS: dict[str, Callable[[Axes, Drawn], None]] = {
 
 #: Bounds that the point plant can clamp at.
 CLAMPS = ("speed_lower_mps", "speed_upper_mps", "input_lower_mps2", "input_upper_mps2")
-#: Laws of a comparison, in order; ``sumo`` only where there is such a controller.
-LAWS = ("fully_distributed", "robust_constrained", "emu_finite_time", "ordinary_consensus", "fault_tolerant", "sumo")
+#: Rows of a comparison, in order -> their law: ordinary consensus and SUMO's two kinds of block are keys of one.
+LAWS = {
+    "fully_distributed": "fully_distributed", "robust_constrained": "robust_constrained", "emu_finite_time": "emu_finite_time",
+    "ordinary_consensus": "emu_finite_time", "fault_tolerant": "fault_tolerant", "sumo_fixed_block": "sumo",
+    "sumo_moving_block": "sumo",
+}  # fmt: skip
 
 
 def alternatives(data: Mapping[str, Any], known: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -144,18 +150,22 @@ def alternatives(data: Mapping[str, Any], known: Sequence[str]) -> dict[str, dic
     Returns
     -------
     dict
-        Name of the law -> tables of its scenario. Keys of the laws' own that have a counterpart in the scenario's bounds are
+        Name of the row -> tables of its scenario. Keys of the laws' own that have a counterpart in the scenario's bounds are
         derived from it; all others are the law's defaults (the paper's).
     """
     found: dict[str, dict[str, Any]] = {}
-    for name in LAWS:
-        law = "emu_finite_time" if name == "ordinary_consensus" else name
-        if law not in known:
-            continue
-        ordinary = float(data["controller"].get("alpha_1", 0.9)) == 1.0
-        own = data["controller"]["law"] == law and ordinary == (name == "ordinary_consensus")
-        found[name] = dict(data) if own else _under(name, law, data)
+    for name, law in LAWS.items():
+        if law in known:
+            found[name] = dict(data) if name == _row(data["controller"]) else _under(name, law, data)
     return found
+
+
+def _row(controller: Mapping[str, Any]) -> str:
+    """The row a scenario is as it stands."""
+    law = str(controller["law"])
+    if law == "emu_finite_time" and float(controller.get("alpha_1", 0.9)) == 1.0:
+        return "ordinary_consensus"
+    return f"sumo_{controller.get('block', 'fixed')}_block" if law == "sumo" else law
 
 
 def _under(name: str, law: str, data: Mapping[str, Any]) -> dict[str, Any]:
@@ -177,6 +187,8 @@ def _under(name: str, law: str, data: Mapping[str, Any]) -> dict[str, Any]:
     elif law == "emu_finite_time":
         controller |= _clear_distances(data) | {"alpha_1": 1.0 if name == "ordinary_consensus" else 0.9}
         run["sub_step_s"] = 0.0025 if name == "ordinary_consensus" else 0.01
+    elif law == "sumo":
+        controller["block"] = "fixed" if name == "sumo_fixed_block" else "moving"
     elif law == "fault_tolerant":
         error = max((abs(value) for value in _errors_allowed(data)), default=2351.0)
         far = 2.0 * error  # of a train that follows the reference from another train's slot

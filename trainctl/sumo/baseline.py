@@ -394,16 +394,17 @@ def write_routes(p: Prepared, line: Line, path: Path) -> None:
         f' length="{length!r}" maxSpeed="{top!r}" sigma="0" speedFactor="1" speedDev="0"/>'
         for (length, top), kind in kinds.items()
     ]
-    for t, length, top in zip(trains, lengths.tolist(), tops.tolist(), strict=True):
+    for k, (t, length, top) in enumerate(zip(trains, lengths.tolist(), tops.tolist(), strict=True)):
         position = t.position_m if entry is None else entry
         _, lane = line.locate(t.track, position)
         speed = float(t.speed_mps) if entry is None else p.params.entry_speed_mps
-        given = "" if speed is None else f' departSpeed="{speed!r}"'
-        checks = ' insertionChecks="none"' if entry is None else ""
-        lines.append(
-            f'    <vehicle id={quoteattr(t.id)} type="{kinds[length, top]}" depart="0" departLane="0" departPos="{float(lane)!r}"'
-            f'{given}{checks}><route edges="{" ".join(line.route(t.track, position))}"/></vehicle>'
-        )
+        given = {
+            "id": t.id, "type": kinds[length, top], "depart": f"{k * p.params.entry_every_s:.3f}", "departLane": "0",
+            "departPos": repr(float(lane)), "departSpeed": None if speed is None else repr(speed),
+            "insertionChecks": "none" if entry is None else None,
+        }  # fmt: skip
+        words = "".join(f" {key}={quoteattr(value)}" for key, value in given.items() if value is not None)
+        lines.append(f'    <vehicle{words}><route edges="{" ".join(line.route(t.track, position))}"/></vehicle>')
     path.write_text("\n".join([*lines, "</routes>", ""]), encoding="utf-8")
 
 
