@@ -57,25 +57,28 @@ def look(
         Targets are the bodies ahead and the places where trains are held, limits those of the edges under every train and ahead.
     """
     placed = along.places(ways, net, row, s, length, present, horizon, order)
-    ahead, body = along.ahead(placed), along.obstacles(placed, virtual=False)
-    clear = _targets(body, held, speed, present)
-    targets = _targets(along.obstacles(placed), held, speed, present) if len(placed.join_train) else clear
-    there = np.where(body.sense != 0, body.room, np.inf)
-    return View(ahead, targets, clear, Limits(*_limits(ways, limit, row, s, length, present, horizon)), there, body.train)
+    bodies = along.bodies(placed, virtual=False)
+    clear = _targets(bodies, held, speed, present)
+    targets = _targets(along.bodies(placed), held, speed, present) if len(placed.join_train) else clear
+    room, body = np.full(len(row), np.inf), np.full(len(row), -1, np.int64)
+    far_first = np.argsort(-bodies.room)
+    there = far_first[bodies.sense[far_first] != 0]
+    room[bodies.train[there]], body[bodies.train[there]] = bodies.room[there], bodies.other[there]  # the nearest is written last
+    return View(along.ahead(placed), targets, clear, Limits(*_limits(ways, limit, row, s, length, present, horizon)), room, body)
 
 
-def _targets(body: along.Obstacles, held: Floats, speed: Floats, present: Bools) -> Targets:
+def _targets(body: along.Bodies, held: Floats, speed: Floats, present: Bools) -> Targets:
     """Bodies in the way, and the places where trains are held."""
-    blocked = np.flatnonzero((body.train >= 0) & present)
+    blocked = np.flatnonzero(present[body.train])
     kind = np.where(body.sense > 0, TRAIN, np.where(body.sense < 0, OPPOSING, SWITCH))[blocked]
     waits = np.flatnonzero(np.isfinite(held) & present)
     return Targets(
-        train=np.concatenate([blocked, waits]),
+        train=np.concatenate([body.train[blocked], waits]),
         room=np.concatenate([body.room[blocked], held[waits]]),
-        speed=np.concatenate([np.where(kind == SWITCH, 0.0, speed[body.train[blocked]]), np.zeros(len(waits))]),
+        speed=np.concatenate([np.where(kind == SWITCH, 0.0, speed[body.other[blocked]]), np.zeros(len(waits))]),
         moving=np.concatenate([kind != SWITCH, np.zeros(len(waits), bool)]),
         kind=np.concatenate([kind, np.full(len(waits), SWITCH)]).astype(np.int64),
-        other=np.concatenate([body.train[blocked], np.full(len(waits), -1)]),
+        other=np.concatenate([body.other[blocked], np.full(len(waits), -1)]),
     )
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from sumo_net.line import LineCrossover
 from trainctl import supervisor
 from trainctl.errors import InputError
 from trainctl.prepare import Prepared
@@ -86,7 +87,7 @@ class Reroutes:
                 if any(i == other for other, _ in found):
                     raise Refused("it has just been given another route")
                 if event.to_edge is None:
-                    edges, more = self._over_a_crossover(event, i, seen, float(speed[i]), lock)
+                    edges, more = self._over_a_crossover(event, i, seen, speed, lock)
                 else:
                     edges, more = self._to_an_edge(event, i, seen, ways, lock)
             except Refused as why:
@@ -115,10 +116,10 @@ class Reroutes:
         return j >= 0 and bool(seen.position[j] - self.length[j] - seen.position[i] < event.gap_below_m)
 
     def _over_a_crossover(
-        self, event: Event, i: int, seen: Seen, speed: float, lock: float
+        self, event: Event, i: int, seen: Seen, speeds: Floats, lock: float
     ) -> tuple[tuple[str, ...], dict[str, Any]]:
         line = self.p.line
-        edge, position = int(seen.edge[i]), float(seen.position[i])
+        edge, position, speed = int(seen.edge[i]), float(seen.position[i]), float(speeds[i])
         track = line.tracks[edge]
         if track == event.to_track:
             raise Refused(f"the train is on track {track} already")
@@ -143,13 +144,30 @@ class Reroutes:
             edges = line.route_over(line.edges[edge], over.id)
         except ValueError as error:
             raise LeadsNowhere(str(error)) from None
-        if over.speed_mps < speed and self.p.supervision.mode != "on":
-            raise Refused(
-                f"crossover {over.id} allows {over.speed_mps:g} m/s, the train runs at {speed:g} m/s, and nobody would brake it:"
-                ' [supervisor] mode = "on" does'
-            )
+        if self.p.supervision.mode != "on":
+            self._unprotected(i, over, seen, speeds)
         more = {"crossover": over.id, "from_track": over.from_track, "to_track": over.to_track, "switch_m": over.start_m}
         return edges, more
+
+    def _unprotected(self, i: int, over: LineCrossover, seen: Seen, speed: Floats) -> None:
+        """What nobody would save the train from while there is no supervisor."""
+        cure = '[supervisor] mode = "on" does'
+        if over.speed_mps < speed[i]:
+            raise Refused(
+                f"crossover {over.id} allows {over.speed_mps:g} m/s, the train runs at {speed[i]:g} m/s, and nobody would brake it:"
+                f" {cure}"
+            )
+        join = over.start_m + over.length_m
+        after = (join - float(seen.position[i])) / max(float(speed[i]), 0.1)
+        then = seen.position + speed * after
+        there = np.array([self.p.line.tracks[e] == over.to_track for e in seen.edge.tolist()]) & seen.present
+        meets = np.flatnonzero(there & (then - self.length < join) & (then > join - self.length[i]))
+        if len(meets):
+            j = int(meets[0])
+            raise Refused(
+                f"train {self.p.scenario.ids[j]} would be at the join of crossover {over.id} at {join:.1f} m at the same time, and"
+                f" nobody would keep them apart: {cure}"
+            )
 
     def _to_an_edge(
         self, event: Event, i: int, seen: Seen, ways: Ways, lock: float
