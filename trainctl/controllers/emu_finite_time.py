@@ -405,7 +405,7 @@ def largest_sub_step(params: Params, scene: Scene) -> float:
     return RUNGE_KUTTA_LIMIT / fastest if fastest > 0.0 else math.inf
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def rehearse(
     constants: Constants, limits: Floats, leader: Floats, slot: Floats, sender: Ints, heard_from: Ints, desired: Floats,
     start: Floats, h: float, steps: int,
@@ -440,8 +440,12 @@ def rehearse(
                 pull = 0.0
                 for u in range(a, b):
                     v = own[u, SPEED]
-                    fast = max(v, 1e-3)
-                    most, least = min(limits[u, 0], limits[u, 1] / fast), -min(limits[u, 2], limits[u, 3] / fast)
+                    traction, power, braking, braking_power = limits[u]
+                    given, fast = force[u], max(v, 1e-3)
+                    if given > traction or given * fast > power:  # a division only where a limit acts
+                        given = min(traction, power / fast)
+                    elif -given > braking or -given * fast > braking_power:
+                        given = -min(braking, braking_power / fast)
                     drag = units[u, MASS] * (units[u, C0] + (units[u, C1] + units[u, C2] * v) * v) if v > 0.0 else 0.0
                     stretch = 0.0
                     if u + 1 < b:
@@ -449,7 +453,7 @@ def rehearse(
                         w[u] = coupler_weight(stretch, c.h1, c.h2, c.delta1, c.delta2)
                     spring = units[u, K_HAT] * units[u, INERTIA] * stretch
                     rate[u, POSITION] = v
-                    rate[u, SPEED] = (min(max(force[u], least), most) - drag + pull - spring) / units[u, INERTIA]
+                    rate[u, SPEED] = (given - drag + pull - spring) / units[u, INERTIA]
                     pull = spring
                 stiffness = 0.0  # row sums of the Laplacian between couplers: no eigenvalue is larger
                 for u in range(a, b - 1):
