@@ -14,15 +14,21 @@ from trainctl.runner import run
 from trainctl.sumo import gui
 from trainctl.sumo.replay import replay
 
-#: Train 1 takes the crossover to track 3 at 25 km in the 8th second.
+#: Train 1 takes the crossover to track 3 at 99.945 km in the 7th second; braking is strong, so that it is not locked.
 REROUTED = """extends = "three_tracks"
 [run]
 duration_s = 16
+[supervisor]
+emergency_mps2 = 20.0
+service_mps2 = 20.0
 [[event]]
 kind = "reroute"
 train = 1
 to_track = 3
-"""
+""" + "".join(
+    f"[[train]]\nid = {k}\nposition_m = {x + 75000.0}\n"
+    for k, x in enumerate((24400.0, 21400.0, 13400.0, 12400.0, 9400.0, 400.0), 1)
+)
 
 
 @pytest.fixture
