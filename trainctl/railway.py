@@ -34,8 +34,20 @@ ASK_AGAIN_S = 2.0
 #: A train enters if it can do so with this share of its speed.
 ENTERS_WITH = 0.8
 
-#: Share of the reference speed above the least speed of a law below which a formation dissolves.
+#: A formation dissolves this share of the cruising speed above the least speed its law can hold; to form it needs thrice that.
 DISSOLVES = 0.02
+
+#: Trains that must slow down, stop or wait within this time do not couple before [s].
+SOON_S = 60.0
+
+#: A train that uncoupled does not couple again to the same one within this time [s].
+APART_S = 30.0
+
+#: Share of the haste to catch up with another formation that is left while a train behind is nearer to joining this one.
+HASTE = 0.5
+
+#: Share of the room between cruising speed and the greatest speed that haste may use.
+ROOM_FOR_HASTE = 0.75
 
 
 class Lookout:
@@ -186,8 +198,11 @@ class Service:
         self.came, self.left = np.zeros(n, bool), np.zeros(n, bool)
         self.next_stop = np.zeros(n, np.int64)
         self.stands_until = np.full(n, np.nan)  # s, while a train stands at a stop
-        self.stopping = np.zeros(n, bool)
+        self.stopping, self.stops_soon = np.zeros(n, bool), np.zeros(n, bool)
         self.ask_at = np.zeros(n)
+        self.parted: Ints = np.full(n, -1)  # the train each was coupled to before
+        self.refused: Ints = np.full(n, -1)  # the train the law did not let each couple to, as was told
+        self.least, self.greatest = _band(p, self.spacing) if self.roster.cooperates.sum() > 1 else (-np.inf, np.inf)
         # The driver brakes as planned and keeps farther away, so that the supervisor has nothing to do.
         rate = min(self.driving.deceleration_mps2, rules.emergency_mps2)
         self.rules = rules.model_copy(update={
@@ -293,8 +308,10 @@ class Service:
             rooms.append(max(room, 0.0))
         found, room_to = np.array(trains, np.int64), np.array(rooms)
         braking = supervisor.stopping_distance(np.maximum(speed[found], 0.0), self.rules.service_mps2, self.step, self.theta)
-        near = np.zeros(self.n, bool)
+        near, soon = np.zeros(self.n, bool), np.zeros(self.n, bool)
         near[found] = room_to < braking + 10.0 * self.step * speed[found] + 50.0
+        soon[found] = room_to < braking + SOON_S * speed[found]
+        self.stops_soon = soon | near
         self.stopping = (self.stopping & seen.present | near) & (near | self.standing)
         return found, room_to
 
@@ -309,21 +326,20 @@ class Service:
         willing = seen.present & self.roster.cooperates & ~self.stopping & ~self.standing & ~held
         for i in convoys.broken(self.ahead, view.ahead.train, willing).tolist():
             j = int(self.ahead[i])
-            why = "its train ahead is another one" if view.ahead.train[i] != j else "one of the two stops, waits or has left"
-            journal.event(t, "uncouple", train=ids[i], ahead=ids[j], reason=why)
-            self.ahead[i] = -1
-        for i in self._too_slow(own).tolist():
-            why = "the reference falls to the least speed of a member"
-            journal.event(t, "uncouple", train=ids[i], ahead=ids[int(self.ahead[i])], reason=why)
-            self.ahead[i] = -1
-        free = convoys.candidates(self.ahead, view.ahead.train, along.behind(view.ahead).train, willing)
-        for i in free[self.ask_at[free] <= t].tolist():
+            self._part(i, t, _why(i, j, seen.present, view.ahead.train), journal)
+        for i in self._too_slow().tolist():
+            self._part(i, t, "the reference falls below what the law can hold", journal)
+        free = convoys.candidates(self.ahead, view.ahead.train, along.behind(view.ahead).train, willing & ~self.stops_soon)
+        for i in free[(self.ask_at[free] <= t) & ~self._slows_soon(own, view)[free]].tolist():
             j, spacing = int(view.ahead.train[i]), float(view.ahead.spacing[i])
             if self._fits(i, j, spacing, own) and convoys.fronts(self.ahead)[j] != i:
                 self.ask_at[i] = t + ASK_AGAIN_S
                 reasons = self._try(i, j, spacing, t, own)
                 if not reasons:
                     journal.event(t, "couple", train=ids[i], ahead=ids[j], spacing_m=spacing)
+                elif self.refused[i] != j:
+                    journal.event(t, "join_delayed", train=ids[i], ahead=ids[j], reasons=reasons)
+                self.refused[i] = j if reasons else -1
         changed = not np.array_equal(before, self.ahead)
         alone = ~self.led
         head = own[p.heads]
@@ -373,14 +389,31 @@ class Service:
                 part[behind] = part[lead]
         return reasons
 
-    def _too_slow(self, own: Floats) -> Ints:
-        """Coupled trains of formations whose reference nears the least speed of a member."""
-        least = self.p.bounds.speed_lower
-        floor = np.where(np.isfinite(least), least, 0.0) + DISSOLVES * self.cruise
-        front = convoys.fronts(self.ahead)
-        slow = np.zeros(self.n, bool)
-        np.logical_or.at(slow, front, self.pace.speed < floor)
-        return np.flatnonzero((self.ahead >= 0) & slow[front])
+    def _part(self, i: int, t: float, why: str, journal: Journal) -> None:
+        ids = self.p.scenario.ids
+        journal.event(t, "uncouple", train=ids[i], ahead=ids[int(self.ahead[i])], reason=why)
+        self.parted[i], self.ask_at[i] = self.ahead[i], t + APART_S
+        self.ahead[i] = -1
+
+    def _too_slow(self) -> Ints:
+        """Coupled trains of formations whose reference nears the least speed the law can hold."""
+        slow = self.pace.speed < self.least + DISSOLVES * self.cruise
+        return np.flatnonzero((self.ahead >= 0) & slow[convoys.fronts(self.ahead)])
+
+    def _slows_soon(self, own: Floats, view: View) -> Bools:
+        """Trains that must soon run slower than a formation can, or whose train ahead must."""
+        speed, lowest = own[self.p.heads, SPEED], np.full(self.n, np.inf)
+        lines = view.limits
+        close = lines.distance < SOON_S * np.maximum(speed, 1.0)[lines.train]
+        np.minimum.at(lowest, lines.train[close], self._below(lines.speed[close]))
+        slows = lowest < self.least + 3.0 * DISSOLVES * self.cruise
+        found: Bools = slows | slows[convoys.fronts(self.ahead)][view.ahead.train]
+        return found
+
+    def _below(self, limit: Floats) -> Floats:
+        """Speed the driver keeps where the limit is ``limit`` [m/s]."""
+        below: Floats = np.maximum(limit - self.driving.below_limit_mps, 0.2 * limit)
+        return below
 
     def links(self) -> Links:
         """Who hears whom."""
@@ -395,7 +428,7 @@ class Service:
         led, front = self.led, convoys.fronts(self.ahead)
         first = front == np.arange(self.n)
         v = np.maximum(np.where(led, self.pace.speed, speed), 0.0)
-        limits = view.limits._replace(speed=np.maximum(view.limits.speed - self.driving.below_limit_mps, 0.2 * view.limits.speed))
+        limits = view.limits._replace(speed=self._below(view.limits.speed))
         by_limits = supervisor.verdict(self.rules, v, supervisor.no_targets(), limits, self.step, self.theta).greatest
         targets = lookout.with_targets(lookout.of(view.targets, first[view.targets.train]), *stops, STOP)
         clear = lookout.with_targets(lookout.of(view.clear, first[view.clear.train]), *stops, STOP)
@@ -417,11 +450,14 @@ class Service:
             & ~self.standing[other] & (view.ahead.spacing <= self.driving.join_range_m) & (self.ahead != other)
         )  # fmt: skip
         j = other[near]
-        target = v[j] + convoys.closing_speed(view.ahead.spacing[near] - self.spacing.desired)
-        most = np.minimum(self.cruise[near] + self.driving.catch_up_mps, self.roster.top_speed[near])
-        upper = self.p.bounds.speed_upper[near]
-        most = np.where(np.isfinite(upper), np.minimum(most, upper - 0.25 * (upper - self.cruise[near])), most)
-        wish[near] = np.clip(target, 0.0, np.maximum(most, 0.0))
+        error = view.ahead.spacing[near] - self.spacing.desired
+        behind = np.full(self.n, np.inf)  # how much farther apart than wanted the next one runs that wants to join
+        np.minimum.at(behind, convoys.fronts(self.ahead)[j], np.where(error > 0.0, error, np.inf))
+        yields, cruise = behind[near] < error, self.cruise[near]
+        most = np.minimum(cruise + np.where(yields, HASTE, 1.0) * self.driving.catch_up_mps, self.roster.top_speed[near])
+        most = np.minimum(most, cruise + np.maximum(ROOM_FOR_HASTE * (self.p.bounds.speed_upper[near] - cruise), 0.0))
+        most = np.where(yields | self.led[near], np.minimum(most, self.greatest), most)
+        wish[near] = np.clip(v[j] + convoys.closing_speed(error), 0.0, most)
         return wish
 
     def advance(self) -> None:
@@ -434,3 +470,47 @@ class Service:
     def leader(self) -> Floats:
         """Position, speed, acceleration and jerk of every train's own reference, shape (4, n)."""
         return np.stack([*self.pace, np.zeros(self.n)])
+
+
+def _why(i: int, j: int, present: Bools, next_ahead: Ints) -> str:
+    """Why ``i`` must uncouple from ``j``."""
+    if not present[j]:
+        return "the train ahead has left"
+    if next_ahead[i] < 0:
+        return "the train ahead has gone another way"
+    return "one of the two stops or waits" if next_ahead[i] == j else "another train is ahead now"
+
+
+#: How exactly the band is found [m/s].
+BAND_MPS = 0.05
+
+
+def _band(p: Prepared, spacing: convoys.Spacing) -> tuple[float, float]:
+    """Least and greatest speed of a reference with which the law takes one train of each kind as a formation [m/s]."""
+    cruise = float(p.scenario.reference.speed_mps or 0.0)
+    kinds = np.unique([t.type for t in p.scenario.train], return_index=True)[1]
+    others = np.setdiff1d(np.arange(len(p.scenario.train)), kinds)
+    members = np.sort(np.concatenate([kinds, others[: max(2 - len(kinds), 0)]]))
+    ahead: Ints = np.full(len(p.scenario.train), -1)
+    ahead[members[1:]] = members[:-1]
+    order = convoys.front_to_rear(ahead)
+    slot = convoys.slots(ahead, order, spacing.desired, np.zeros(len(ahead)))
+    links = convoys.links(ahead, order, slot, spacing)
+    units, own = np.diff(p.consists.first), p.own.copy()
+    own[:, POSITION] += np.repeat(slot - own[p.heads, POSITION], units)
+
+    def takes(v: float) -> bool:
+        own[:, SPEED] = v
+        scene = p.scene(own, links, 0.0)._replace(reference=Reference(np.array([0.0, np.inf]), np.array([[0.0, v, 0.0]])))
+        return not p.law.violations(p.params, restrict(scene, members))
+
+    def end(good: float, bad: float) -> float:
+        if takes(bad):
+            return bad
+        while abs(good - bad) > BAND_MPS:
+            middle = 0.5 * (good + bad)
+            good, bad = (middle, bad) if takes(middle) else (good, middle)
+        return good
+
+    top = cruise + (p.scenario.traffic or Traffic()).catch_up_mps
+    return end(cruise, 0.0), end(cruise, top)

@@ -26,7 +26,7 @@ class Balance:
     Attributes
     ----------
     stored : ndarray, shape (n,)
-        Kinetic and coupler energy at the last row [J]; NaN before the first.
+        Kinetic and coupler energy at the last row [J]; NaN before the first, and of trains that are not there.
     drift : ndarray, shape (n,)
         Energy that came from nowhere since the start [J].
     turnover : ndarray, shape (n,)
@@ -58,11 +58,11 @@ class Balance:
         if row.extremes is not None:
             now = self.energy(row.own)
             accounted = row.extremes.energy @ SIGNS + self.kicked
-            if not np.isnan(self.stored).any():
-                self.drift += now - self.stored - accounted
-            self.stored = now
+            known = ~np.isnan(self.stored)  # neither the first row nor a train that has just come
+            self.drift[known] += (now - self.stored - accounted)[known]
+            self.stored = np.where(row.seen.present, now, np.nan)
             self.kicked = np.zeros_like(now)
-            self.turnover += np.abs(row.extremes.energy).sum(axis=1)
+            self.turnover[known] += np.abs(row.extremes.energy).sum(axis=1)[known]
             out = np.abs(self.drift) > self.LIMIT * self.turnover + ROUNDING * now
             for i in np.flatnonzero(out).tolist():
                 yield i, float(self.drift[i] / max(self.turnover[i], ROUNDING * now[i]))
