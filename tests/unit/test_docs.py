@@ -37,6 +37,13 @@ REPLACED: dict[str, tuple[str | None, str]] = {
     "trainctl run --gui": ("trainctl run --gui --gui-program sumo --set run.duration_s=24", "no screen: the same without a window"),
     "trainctl replay runs/three_tracks --from-s 990": (
         "trainctl replay runs/three_tracks --from-s 9 --gui-program sumo", "no screen; the run above has 24 s"),
+    "trainctl run three_tracks --set controller.law=sumo --set controller.block=moving --out runs/moving": (
+        "trainctl run three_tracks --set controller.law=sumo --set controller.block=moving --out runs/moving"
+        " --set run.duration_s=60", "quicker"),
+    "trainctl run three_tracks --set controller.law=sumo --set controller.signals_m=4000 --out runs/fixed": (
+        "trainctl run three_tracks --set controller.law=sumo --set controller.signals_m=4000 --out runs/fixed"
+        " --set run.duration_s=60", "quicker"),
+    "trainctl compare capacity": (None, "three minutes; tests/unit/test_capacity.py runs it"),
     "trainctl run my_law/my_law.toml": ("trainctl run my_law/my_law.toml --set run.duration_s=24", "2400 s take too long"),
     "python -m pytest my_law": (None, "test_new.py runs these tests"),
     "sumo-gui -n nets/three_tracks.net.xml": ("sumo -n nets/three_tracks.net.xml -e 1", "no screen"),
