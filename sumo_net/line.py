@@ -197,7 +197,7 @@ def rail_edges(net: NetFile, path: str | Path) -> list[NetEdge]:
 def line_of(found: list[NetEdge], file: str) -> Line:
     """The line its rail edges describe, if ``sumo_net`` built them."""
     if not any("track" in e.params for e in found):
-        rule = "so far only nets built by sumo_net are supported"
+        rule = "only nets built by sumo_net have it; others run with network.sumocfg"
         raise LineError([f"{file}: none of its {len(found)} rail edges has a 'track' parameter: {rule}"])
     mistakes, rows = [], []
     for e in found:

@@ -1,4 +1,4 @@
-"""A picture of a line: tracks and crossovers above, speed limit and gradient below, along one kilometrage."""
+"""A picture of a line: tracks and crossovers above, speed limit and gradient below, along one kilometrage. And of any net."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sumo_net.line import Line, LineCrossover
+from sumo_net.shapes import shapes
 from sumo_net.spec import text
 
 if TYPE_CHECKING:
@@ -18,6 +19,9 @@ _NARROWEST = 0.006
 
 #: More ids than this in one picture cannot be read; ids that were given by hand are always shown.
 _MOST_IDS = 16
+
+#: More edges than this are not named in the picture of a net; beyond this ratio of sides it is not drawn to scale.
+_MOST_EDGES, _FLAT = 40, 8.0
 
 _TRACK, _CROSSOVER, _NAMED, _SPEED, _SLOPE = "#333333", "#7d8597", "#d1495b", "#00798c", "#8d6a3f"
 
@@ -64,6 +68,58 @@ def show(line: Line, path: str | Path, from_m: float | None = None, to_m: float 
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     # No date or version in the file: the same line gives the same picture.
+    figure.savefig(path, dpi=120, metadata={".png": {"Software": None}, ".svg": {"Date": None}}.get(path.suffix.lower()))
+    return path
+
+
+def show_net(net: str | Path, path: str | Path, title: str = "") -> Path:
+    """Draw the rail edges of any SUMO net as they lie, coloured by speed limit, into an image file; the path of the image.
+
+    Parameters
+    ----------
+    net : str or Path
+        The net.
+    path : str or Path
+        Image file, for instance ``net.png`` or ``net.svg``.
+    title : str
+        Headline.
+
+    Raises
+    ------
+    LineError
+        As ``shapes``.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
+
+    pieces = [piece for piece in shapes(Path(net)) if len(piece.points) > 1]
+    points = np.concatenate([piece.points for piece in pieces]) / 1000
+    width, height = np.maximum(np.ptp(points, axis=0), 1e-3)
+    figure = Figure(figsize=(14, float(np.clip(12.0 * height / width, 3.0, 10.0)) + 1.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    limits = np.array([piece.speed_mps for piece in pieces])
+    lines = LineCollection([piece.points / 1000 for piece in pieces], array=limits, cmap="viridis", linewidths=2.0)
+    lines.set_clim(0.9 * limits.min(), 1.05 * limits.max())
+    axes.add_collection(lines)
+    normal = [piece for piece in pieces if not piece.internal]
+    for piece in normal if len(normal) <= _MOST_EDGES else ():
+        across = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(piece.points, axis=0).T))])
+        x, y = (float(np.interp(across[-1] / 2, across, part)) / 1000 for part in piece.points.T)
+        axes.annotate(piece.edge, (x, y), xytext=(0, 5), textcoords="offset points", ha="center", fontsize=8, color=_TRACK)
+    ends = np.array([piece.points[k] for piece in normal for k in (0, -1)]) / 1000
+    axes.plot(*ends.T, linestyle="none", marker="o", markersize=3, color=_CROSSOVER)
+    # True to scale, unless the net is so long and flat that nothing could be told apart.
+    stretched = width > _FLAT * height
+    axes.set_aspect("auto" if stretched else "equal", adjustable="datalim")
+    axes.margins(0.03, 0.15)
+    axes.set_xlabel("x [km]")
+    axes.set_ylabel("y [km]" + (" (not to the scale of x)" if stretched else ""))
+    axes.set_title(title or f"{Path(net).name}: {len(normal)} rail edges", loc="left", fontsize=9)
+    figure.colorbar(lines, ax=axes, label="limit [m/s]", shrink=0.9)
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120, metadata={".png": {"Software": None}, ".svg": {"Date": None}}.get(path.suffix.lower()))
     return path
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sumo_net.line import rail_edges
 from sumo_net.netfile import RAIL, read_net
 from sumo_net.spec import LineError
 
@@ -43,3 +44,14 @@ def shapes(net: Path) -> list[Piece]:
     if not any(not piece.internal for piece in found):
         raise LineError([f"{net}: has no rail edges: none of its lanes allows a rail class by name"])
     return found
+
+
+def built_here(net: Path) -> bool:
+    """Whether a net was built by ``sumo_net``, with tracks and kilometrage in it; else it is just any rail net.
+
+    Raises
+    ------
+    LineError
+        If there is no such file, it is not a net, or it has no rail edges.
+    """
+    return any("track" in edge.params for edge in rail_edges(read_net(net), net))

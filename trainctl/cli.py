@@ -320,17 +320,23 @@ def net_build(
 
 @net.command("show")
 def net_show(
-    name: Annotated[str, typer.Argument(help="Name of a shipped line, path of a line TOML or of a net built here.")],
+    name: Annotated[str, typer.Argument(help="Name of a shipped line, path of a line TOML or of any SUMO rail net.")],
     out: Annotated[Path | None, typer.Option(help="Picture file (.png, .svg, .pdf); default NAME.png.")] = None,
     from_m: Annotated[float | None, typer.Option(help="Show from this kilometrage on [m].")] = None,
     to_m: Annotated[float | None, typer.Option(help="Show up to this kilometrage [m].")] = None,
 ) -> None:
-    """Draw tracks and crossovers of a line."""
+    """Draw tracks and crossovers of a line, or any SUMO rail net as it lies."""
     import sumo_net
-    from sumo_net.picture import show
+    from sumo_net.picture import show, show_net
+    from sumo_net.shapes import built_here
 
-    line = _net(lambda: sumo_net.Line.read(name) if name.endswith(".xml") else sumo_net.Line.of(_line_spec(name)))
     path = out or Path(f"{Path(name).name.split('.')[0]}.png")
+    if name.endswith(".xml") and not _net(lambda: built_here(Path(name))):
+        if from_m is not None or to_m is not None:
+            raise InputError(f"--from-m, --to-m: {name} has no kilometrage; only lines built by `trainctl net build` have one")
+        print(_net(lambda: show_net(name, path)))
+        return
+    line = _net(lambda: sumo_net.Line.read(name) if name.endswith(".xml") else sumo_net.Line.of(_line_spec(name)))
     _net(lambda: show(line, path, from_m=from_m, to_m=to_m))
     print(path)
 

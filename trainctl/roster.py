@@ -103,7 +103,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
             Train(
                 id=d.id, type=d.kind, track=d.edges[0], position_m=float(begin[0] + d.position_m),
                 speed_mps=min(float(d.speed_mps if d.speed_mps is not None else scenario.reference.speed_mps or 0.0),
-                              traffic.kinds[d.kind].max_speed_mps),
+                              traffic.kinds[d.kind].max_speed_mps, float(rails.speed_mps[way[0]])),
             )
         )  # fmt: skip
     if found:

@@ -70,6 +70,8 @@ def violations(params: Params, scene: Scene) -> list[str]:
 def unfit(scenario: Any) -> list[str]:
     """Parts of a ``scenario`` (``trainctl.scenario.Scenario``) that SUMO's own trains would not feel."""
     found = [f"{key}: SUMO's own trains take none" for key in ("disturbance", "fault") if getattr(scenario, key)]
+    if scenario.network.sumocfg is not None:
+        found.append("controller.law = sumo: not with network.sumocfg yet; SUMO runs that file itself, without trainctl")
     if scenario.network.net is not None and scenario.controller.keys().get("signals_m") is not None:
         found.append("controller.signals_m: network.net has the signals it has; build it with signals_m, or name its line")
     return found

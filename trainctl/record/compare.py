@@ -106,7 +106,7 @@ def _relative(axes: Axes, drawn: Drawn) -> None:
     for name, rows in drawn.trains.slices():
         at = 0.0 if reference is None else leader(reference, time[rows])[0]
         style.draw(axes, time[rows], (position[rows] - at) / 1000, label=f"train {name}", **drawn.look[name])
-    axes.set_ylabel(r"$x_i - x_r$ [km]")
+    axes.set_ylabel("position [km]" if reference is None else r"$x_i - x_r$ [km]")
 
 
 def _errors(axes: Axes, drawn: Drawn) -> None:
@@ -171,9 +171,10 @@ def _row(controller: Mapping[str, Any]) -> str:
 def _under(name: str, law: str, data: Mapping[str, Any]) -> dict[str, Any]:
     changed: dict[str, Any] = {key: value for key, value in data.items() if key not in ("controller", "observer")}
     changed["title"] = f"{name.replace('_', ' ')} on the traffic of: {data.get('title', '')}"
-    run = {key: value for key, value in data["run"].items() if key != "control_period_s"}
+    run = {"step_s": 1.0, **{key: value for key, value in data["run"].items() if key != "control_period_s"}}
     topology = dict(data.get("topology", {}))
-    point = data["plant"]["kind"] == "point"
+    plant = data.get("plant", {"kind": "point"})
+    point = plant.get("kind", "point") == "point"
     controller: dict[str, Any] = {"law": law}
     if law == "fully_distributed":
         controller["eta"] = "own_speed"
@@ -183,7 +184,7 @@ def _under(name: str, law: str, data: Mapping[str, Any]) -> dict[str, Any]:
         topology["weight"] = 0.01
         run["control_period_s"] = run["step_s"] * max(1.0, round(1.0 / run["step_s"]))
         if point:  # its model clamps speed and input
-            changed["plant"] = {**data["plant"], **{key: value for key, value in data.get("bounds", {}).items() if key in CLAMPS}}
+            changed["plant"] = {**plant, **{key: value for key, value in data.get("bounds", {}).items() if key in CLAMPS}}
     elif law == "emu_finite_time":
         controller |= _clear_distances(data) | {"alpha_1": 1.0 if name == "ordinary_consensus" else 0.9}
         run["sub_step_s"] = 0.0025 if name == "ordinary_consensus" else 0.01
@@ -198,7 +199,7 @@ def _under(name: str, law: str, data: Mapping[str, Any]) -> dict[str, Any]:
         changed["train_type"] = {key: {"actuator_rate_per_s": 50.0, **kind} for key, kind in data.get("train_type", {}).items()}
         run["sub_step_s"] = 0.01
     if not point and law != "fault_tolerant":
-        changed["plant"] = data["plant"] if data["plant"]["kind"] == "coupled_units" else {"kind": "coupled_units"}
+        changed["plant"] = plant if plant["kind"] == "coupled_units" else {"kind": "coupled_units"}
     return {**changed, "run": run, "topology": topology, "controller": controller}
 
 
