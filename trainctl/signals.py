@@ -67,6 +67,11 @@ class Consists(NamedTuple):
         """Mass of every train [kg], shape (n,)."""
         return np.add.reduceat(self.mass, self.first[:-1])
 
+    def train_davis(self) -> Floats:
+        """Davis coefficients of every train, shape (n, 3): the mean of its units weighted by mass."""
+        weighted = np.add.reduceat(self.mass[:, None] * self.davis, self.first[:-1])
+        return np.asarray(weighted / self.train_mass()[:, None])
+
 
 class Links(NamedTuple):
     """Who hears whom now: one row per directed hearing, sorted by receiver. Spacings are front to front, sender minus receiver."""

@@ -47,7 +47,7 @@ import numpy as np
 from numba import njit
 from pydantic import Field
 
-from trainctl.signals import POSITION, SPEED, Bools, Consists, Demand, Floats, Links, Reference, Scene, Table, Trains, leader_at
+from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, Reference, Scene, Table, Trains, leader_at
 
 CLOCK: Literal["sampled"] = "sampled"
 
@@ -85,7 +85,7 @@ class Constants(NamedTuple):
 
 def constants(params: Params, scene: Scene) -> Constants:
     """Constants of the law; see ``SampledLaw``."""
-    davis = _train_davis(scene.consists)
+    davis = scene.consists.train_davis()
     f, F = _resistance_range(davis, scene.bounds.speed_lower, scene.bounds.speed_upper)
     return Constants(
         period=scene.control_period, theta=scene.lead,
@@ -186,12 +186,6 @@ def _resistance(v: Floats, davis: Floats) -> Floats:
     return davis[:, 0] + davis[:, 1] * v + davis[:, 2] * v**2
 
 
-def _train_davis(consists: Consists) -> Floats:
-    """Davis coefficients per train, (n, 3): the mean of its units weighted by mass."""
-    weighted = np.add.reduceat(consists.mass[:, None] * consists.davis, consists.first[:-1])
-    return np.asarray(weighted / consists.train_mass()[:, None])
-
-
 def _resistance_range(davis: Floats, rho: Floats, Rho: Floats) -> tuple[Floats, Floats]:
     """Least and greatest resistance on [rho, Rho], (n,) each. No coefficient is negative, so it grows with the speed."""
     return _resistance(rho, davis), _resistance(Rho, davis)
@@ -248,7 +242,7 @@ def _input_violations(scene: Scene, slow: float, fast: float) -> Iterator[str]:
     """Assumption 2.4 for reference speeds from ``slow`` to ``fast`` [m/s]."""
     rho, Rho, mu, Mu = scene.bounds
     T = scene.control_period
-    f, F = _resistance_range(_train_davis(scene.consists), rho, Rho)
+    f, F = _resistance_range(scene.consists.train_davis(), rho, Rho)
     brakes, pulls = mu < f, Mu > F
     cure = ""
     if brakes.all() and pulls.all():

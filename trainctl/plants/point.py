@@ -97,13 +97,12 @@ def constants(
     Constants
     """
     n = len(consists.first) - 1
-    weighted = np.add.reduceat(consists.mass[:, None] * consists.davis, consists.first[:-1])
 
     def everywhere(value: float | None, otherwise: float) -> Floats:
         return np.full(n, otherwise if value is None else value)
 
     return Constants(
-        davis=weighted / consists.train_mass()[:, None],
+        davis=consists.train_davis(),
         resistance_factor=np.ones(n) if resistance_factor is None else resistance_factor,
         input_lower=everywhere(params.input_lower_mps2, -np.inf),
         input_upper=everywhere(params.input_upper_mps2, np.inf),
