@@ -122,7 +122,7 @@ class _Progress:
 def _summary(folder: Path, info: dict[str, Any]) -> None:
     """How many runs there are, and in which share of them a bound was broken."""
     from trainctl.cli import _print, _table
-    from trainctl.sweep import shares
+    from trainctl.sweep_results import shares
 
     told = {key: info[key] for key in ("complete", "refused", "failed") if info[key] or key == "complete"}
     print(f"{info['runs']} runs: " + ", ".join(f"{count} {word}" for word, count in told.items()))

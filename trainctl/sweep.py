@@ -22,22 +22,17 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from trainctl.errors import InputError, TrainctlError
 from trainctl.reading import examine, find, read, shipped
-
-if TYPE_CHECKING:
-    import pandas as pd
+from trainctl.sweep_results import RESULTS, reasons, wilson, write_results
 
 FORMAT = "trainctl sweep"
-INFO, ROWS, RESULTS, FIGURE = "sweep.json", "rows.jsonl", "results.parquet", "summary.png"
+INFO, ROWS, FIGURE = "sweep.json", "rows.jsonl", "summary.png"
 
 #: Stream of a run's seed that moves the trains' starts.
 JITTER_STREAM = 3
-
-#: Quantile of the normal distribution for an interval of 95 %.
-Z_95 = 1.959963984540054
 
 #: A run whose worker dies is given to another one; after so many deaths it is taken for the cause.
 MOST_DEATHS = 3
@@ -344,7 +339,7 @@ def sweep(
             "status": status,
             **counts,
             "violated": violated,
-            "reasons": _reasons(ordered),
+            "reasons": reasons(ordered),
             "wall_time_s": round(time.perf_counter() - began, 3),
         }
         _write_info(out, final)
@@ -408,7 +403,7 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
             return
         with (
             LocalCluster(  # type: ignore[no-untyped-call]
-                n_workers=workers, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address=None, silence_logs=50,
+                n_workers=workers, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address=":0", silence_logs=50,
             ) as cluster,
             Client(cluster, set_as_default=False) as client,  # type: ignore[no-untyped-call]
         ):  # fmt: skip
@@ -487,79 +482,3 @@ def _rows(path: Path) -> dict[str, dict[str, Any]]:
             continue
     path.write_text("".join(f"{line}\n" for line in good), encoding="utf-8")
     return found
-
-
-# What came out
-
-
-def wilson(hits: int, total: int, z: float = Z_95) -> tuple[float, float] | None:
-    """Wilson's score interval of a share, ``hits`` of ``total``; None if there is nothing to share."""
-    if total == 0:
-        return None
-    p, n = hits / total, float(total)
-    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
-    half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    low = 0.0 if hits == 0 else max(0.0, centre - half)
-    return low, 1.0 if hits == total else min(1.0, centre + half)
-
-
-def write_results(rows: Sequence[Mapping[str, Any]], path: Path) -> pd.DataFrame:
-    """The dataset: one row per run, in the order of the plan. Nothing in it tells when, where or in which order runs were done."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    from trainctl.record.folder import SCHEMA_VERSION
-
-    parameters = list(dict.fromkeys(key for row in rows for key in row["parameters"]))
-    metrics = sorted({key for row in rows for key in row.get("metrics") or {}})
-    columns: dict[str, list[Any]] = {"run": [row["run"] for row in rows]}
-    columns |= {key: [_plain(row["parameters"].get(key)) for row in rows] for key in parameters}
-    columns |= {key: [row.get(key) for row in rows] for key in ("status", "failure", "violations")}
-    columns |= {key: [(row.get("metrics") or {}).get(key) for row in rows] for key in metrics if key not in columns}
-    arrays = {key: _column(column, pa.float64() if key in metrics else None) for key, column in columns.items()}
-    table = pa.table(arrays).replace_schema_metadata({"schema_version": str(SCHEMA_VERSION), "table": "sweep"})
-    new = path.with_suffix(".new")
-    pq.write_table(table, new, compression="zstd")
-    os.replace(new, path)
-    frame: pd.DataFrame = table.to_pandas()
-    return frame
-
-
-def _reasons(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The first few runs that gave nothing, and why."""
-    without = [row for row in rows if row["status"] != "complete"]
-    found = [f"run {row['run']} {row['status']}: {row['failure']}" for row in without[:5]]
-    return found + ([f"and {len(without) - 5} more"] if len(without) > 5 else [])
-
-
-def shares(folder: Path, varied: Sequence[str]) -> list[dict[str, Any]]:
-    """Share of complete runs with a broken bound for every combination of the settings ``varied``, seeds taken together."""
-    import pandas as pd
-
-    frame = pd.read_parquet(folder / RESULTS)
-    done = frame[frame["status"] == "complete"]
-    groups = done.groupby(list(varied), sort=False, dropna=False) if varied else [((), done)]
-    found = []
-    for values, part in groups:
-        if len(part):
-            hits, total = int((part["violations"] > 0).sum()), len(part)
-            found.append(
-                {"values": tuple(values), "runs": hits, "of": total, "share": hits / total, "interval_95": wilson(hits, total)}
-            )
-    return found
-
-
-def _plain(value: Any) -> Any:
-    """Lists and tables as JSON text."""
-    return json.dumps(value, default=str) if isinstance(value, list | dict) else value
-
-
-def _column(column: list[Any], kind: Any) -> Any:
-    import pyarrow as pa
-
-    known = [value for value in column if value is not None]
-    if kind is None and known and all(isinstance(value, int | float) and not isinstance(value, bool) for value in known):
-        kind = pa.int64() if all(isinstance(value, int) for value in known) else pa.float64()
-    if kind is None and not (known and all(isinstance(value, bool) for value in known)):
-        kind, column = pa.string(), [value if value is None else str(value) for value in column]
-    return pa.array(column, kind)

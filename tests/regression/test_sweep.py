@@ -14,7 +14,8 @@ import pandas as pd
 import psutil
 import pytest
 
-from trainctl.sweep import Plan, jobs, ready_made, simulate, write_results
+from trainctl.sweep import Plan, jobs, ready_made, simulate
+from trainctl.sweep_results import write_results
 
 BIN = Path(sys.executable).parent
 SEEDS, DURATION = range(8), 300

@@ -10,7 +10,8 @@ import pytest
 
 from trainctl import sweep as sweeping
 from trainctl.errors import InputError, LawError
-from trainctl.sweep import Plan, half_width, jobs, prepared, seeds, sweep, values, wilson
+from trainctl.sweep import Plan, half_width, jobs, prepared, seeds, sweep, values
+from trainctl.sweep_results import shares, wilson
 
 SHORT = {"run.duration_s": [20]}
 
@@ -190,5 +191,5 @@ def test_the_ready_made_sweep_is_found_and_its_starts_are_sound():
 def test_shares_are_told_per_combination(alone, tmp_path):
     plan = Plan("fully_distributed", {**SHORT, "bounds.speed_upper_mps": [85.0, 85.5]}, [0, 1], {}, "numeric")
     sweep(plan, tmp_path / "a")
-    rows = sweeping.shares(tmp_path / "a", ["bounds.speed_upper_mps"])
+    rows = shares(tmp_path / "a", ["bounds.speed_upper_mps"])
     assert [(r["values"], r["runs"], r["of"]) for r in rows] == [((85.0,), 0, 2), ((85.5,), 0, 2)]
