@@ -22,6 +22,7 @@ _MOST_IDS = 16
 
 #: More edges than this are not named in the picture of a net; beyond this ratio of sides it is not drawn to scale.
 _MOST_EDGES, _FLAT = 40, 8.0
+_BEHIND = {"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.85}
 
 _TRACK, _CROSSOVER, _NAMED, _SPEED, _SLOPE = "#333333", "#7d8597", "#d1495b", "#00798c", "#8d6a3f"
 
@@ -107,7 +108,7 @@ def show_net(net: str | Path, path: str | Path, title: str = "") -> Path:
     for piece in normal if len(normal) <= _MOST_EDGES else ():
         across = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(piece.points, axis=0).T))])
         x, y = (float(np.interp(across[-1] / 2, across, part)) / 1000 for part in piece.points.T)
-        axes.annotate(piece.edge, (x, y), xytext=(0, 5), textcoords="offset points", ha="center", fontsize=8, color=_TRACK)
+        axes.annotate(piece.edge, (x, y), ha="center", va="center", fontsize=8, color=_TRACK, bbox=_BEHIND)
     ends = np.array([piece.points[k] for piece in normal for k in (0, -1)]) / 1000
     axes.plot(*ends.T, linestyle="none", marker="o", markersize=3, color=_CROSSOVER)
     # True to scale, unless the net is so long and flat that nothing could be told apart.

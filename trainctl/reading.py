@@ -89,11 +89,20 @@ def _read(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
         raise InputError([f"{path.name}: extends = {m}" for m in error.mistakes]) from None
     if under.resolve() in above:
         raise InputError(f"{path.name}: extends = {base}: comes back to itself")
-    return _over(_read(under, (*above, path.resolve())), data)
+    return _over(_found_from(_read(under, (*above, path.resolve())), under.parent, path.parent), data)
+
+
+def _found_from(data: dict[str, Any], here: Path, there: Path) -> dict[str, Any]:
+    """The tables of a file in ``here`` for one in ``there``: files beside the former are named in full."""
+    network = data.get("network")
+    if here.resolve() == there.resolve() or not isinstance(network, dict):
+        return data
+    beside = {k: str(here.resolve() / v) for k, v in network.items() if isinstance(v, str) and (here / v).is_file()}
+    return {**data, "network": {**network, **beside}} if beside else data
 
 
 #: Keys that exclude each other: who states one of them drops the extended file's.
-EXCLUSIVE = {"network": ("line", "net"), "reference": FORMS}
+EXCLUSIVE = {"network": ("line", "net", "sumocfg"), "reference": FORMS}
 
 
 def _over(base: dict[str, Any], data: dict[str, Any]) -> dict[str, Any]:

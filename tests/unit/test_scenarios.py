@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from trainctl.prepare import open_scenario
-from trainctl.reading import examine, load, shipped
+from trainctl.reading import _read, examine, load, shipped
 from trainctl.scenario import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -67,3 +67,20 @@ def test_extension_lays_tables_over_each_other(tmp_path):
     assert mine.run.step_s == paper.run.step_s
     assert [t.position_m for t in mine.train] == [24000, 21000, 13000, 12000, 9950, 0]
     assert mine.event == paper.event
+
+
+def test_files_of_an_extended_scenario_are_found_beside_it(tmp_path):
+    (tmp_path / "mine.toml").write_text('extends = "merging"\n[run]\nduration_s = 8\n')
+    mine, _ = load(str(tmp_path / "mine.toml"))
+    assert mine.network.sumocfg == str(ROOT / "scenarios" / "merging" / "merging.sumocfg")
+    (tmp_path / "other.toml").write_text('extends = "merging"\n[network]\nline = "single_track"\n')
+    data, mistakes = examine(_read(tmp_path / "other.toml"))
+    assert data is None and not any("exactly one of" in line for line in mistakes)
+
+
+def test_a_resolved_scenario_names_the_trains_of_its_configuration_and_a_users_file_does_not():
+    prepared = open_scenario("merging")
+    resolved = tomllib.loads(prepared.scenario.toml())
+    again, mistakes = examine(resolved, resolved=True)
+    assert mistakes == [] and again.ids == prepared.scenario.ids
+    assert examine(resolved)[1] == ["train: not with network.sumocfg, whose own trains run"]
