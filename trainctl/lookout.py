@@ -68,8 +68,11 @@ def look(
 
 
 def _targets(body: along.Bodies, held: Floats, speed: Floats, present: Bools) -> Targets:
-    """Bodies in the way, and the places where trains are held."""
-    blocked = np.flatnonzero(present[body.train])
+    """Bodies in the way, and the places where trains are held.
+
+    Who comes the other way beyond the place where a train is held turns off before, or is held itself.
+    """
+    blocked = np.flatnonzero(present[body.train] & ((body.sense >= 0) | (body.room < held[body.train])))
     kind = np.where(body.sense > 0, TRAIN, np.where(body.sense < 0, OPPOSING, SWITCH))[blocked]
     waits = np.flatnonzero(np.isfinite(held) & present)
     return Targets(
