@@ -119,7 +119,7 @@ class Reroutes:
         self, event: Event, i: int, seen: Seen, speeds: Floats, lock: float
     ) -> tuple[tuple[str, ...], dict[str, Any]]:
         line = self.p.line
-        edge, position, speed = int(seen.edge[i]), float(seen.position[i]), float(speeds[i])
+        edge, position = int(seen.edge[i]), float(seen.position[i])
         track = line.tracks[edge]
         if track == event.to_track:
             raise Refused(f"the train is on track {track} already")

@@ -118,7 +118,8 @@ def blocked(railway, traffic, order, horizon, virtual, i):
                 rear = depth - length[j]
                 deeper = not here or (depth, -j) > (x, -i)
                 if f == e and deeper:
-                    yield away + (rear if virtual else max(rear, 0.0)), j, 1
+                    clipped = not virtual and rear < 0.0 and k > row[i]
+                    yield away + (rear if virtual else max(rear, 0.0)), j, 0 if clipped else 1
                 if railway.twin[e] == f and (not here or size - max(rear, 0.0) > x):
                     yield away + size - min(depth, size), j, -1
                 if f in railway.crossing[e] and deeper:
@@ -169,7 +170,8 @@ def test_ahead_and_obstacles_are_those_of_the_slow_reference(tree, seed, n, hori
             every = set(blocked(railway, traffic, order, horizon, virtual, i)) if present[i] else set()
             mine = [row[1:] for row in rows if row[0] == i]
             assert set(mine) <= every
-            hides = [room for room, j, sense in mine if sense == 1 and runs_along(traffic, horizon, i, j)]
+            on_the_way = [j for _, j, sense in mine if sense == 1 or (sense == 0 and j in standing(traffic, i))]
+            hides = [j for j in on_the_way if runs_along(traffic, horizon, i, j)]
             if not hides:  # then every train that stands in the way is told
                 same_way = {(j, sense) for room, j, sense in every if sense == 1 and room <= horizon and j in standing(traffic, i)}
                 assert same_way <= {(j, sense) for _, j, sense in mine}

@@ -230,7 +230,8 @@ def bodies(places: Places, virtual: bool = True) -> Bodies:
     virtual : bool
         A train that comes over another track and is ahead, see ``ahead``. True: its rear is taken to be its length behind its
         front on the own way, from the horizon until it has wholly joined, so trains sort themselves in before the join. False:
-        only what is there counts: the join is to be kept clear (room to the start of that edge, sense 0), then the body from there.
+        only what is there counts: the join is to be kept clear (room to the start of that edge, sense 0) until its rear has come
+        over it, then the body.
 
     Returns
     -------
@@ -475,7 +476,9 @@ def _in_the_way(
                 told = _deeper(s[j] - ways.begin[r - 1], j, inside, i)
             if j != i and not told and value <= hidden:
                 if write:
-                    other[count], room[count], sense[count] = j, value, 1
+                    # While its rear still is on another track, its being ahead clears nothing here.
+                    clipped = not virtual and not here and rear < 0.0
+                    other[count], room[count], sense[count] = j, value, 0 if clipped else 1
                 count += 1
                 if _runs_along(places, i, k, j, r):
                     hidden = value
