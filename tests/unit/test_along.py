@@ -42,7 +42,7 @@ def test_a_train_over_the_other_track_is_ahead_if_it_is_nearer_to_the_join():
     assert (tails.room.tolist(), tails.train.tolist()) == ([0.0, 450.0, np.inf], [1, 2, -1])
     clear = along.obstacles(here, virtual=False)
     # The tail of 2 hangs back onto a, so it stands in the way of 0 before the join, and at the join for 1.
-    assert (clear.room.tolist(), clear.sense.tolist()) == ([550.0, 500.0, np.inf], [1, 1, 0])
+    assert (clear.room.tolist(), clear.sense.tolist()) == ([550.0, 500.0, np.inf], [1, 0, 0])
 
 
 def test_a_tail_that_has_not_left_the_way_is_in_it_and_one_that_has_is_not():
