@@ -98,19 +98,82 @@ def test_what_can_be_read_agrees():
         sim.step()
 
 
-def test_a_train_is_rerouted_from_outside():
-    with trainctl.Simulation.open("three_tracks", backend="numeric", **{"run.duration_s": 60}) as sim:
+def orders(folder):
+    """What became of orders from outside, in their order: the switch taken, or the reason why not."""
+    told = [e for e in trainctl.open(folder).events if e["kind"].startswith("reroute") and e["train"] == "1"]
+    return [(e["time_s"], e.get("crossover") or e["reason"]) for e in told]
+
+
+def test_a_train_is_rerouted_from_outside_over_the_next_switch_it_can_stop_before(tmp_path):
+    settings = {"run.duration_s": 150, "supervisor.mode": "on"}
+    with trainctl.Simulation.open("three_tracks", backend="numeric", out=tmp_path / "r", **settings) as sim:
         with pytest.raises(InputError, match="no such crossover"):
             sim.reroute("1", crossover="nix")
-        with pytest.raises(InputError, match="either"):
+        with pytest.raises(InputError, match="exactly one of crossover, to_track, to_edge"):
             sim.reroute("1")
         with pytest.raises(InputError, match="no such track"):
             sim.reroute("1", to_track="9")
-        sim.reroute("1", to_track="3")  # at 25 km, the train is at 24.4 km
-        sim.step(8)
+        with pytest.raises(InputError, match="no such edge"):
+            sim.reroute("1", to_edge="nowhere")
+        sim.reroute("1", to_track="3")  # at 25 km is one, but the train at 24.4 km needs 5 km to stop
+        sim.step(137)
+        assert sim.track[0] == "1" and sim.position_m[0] < 35000
+        sim.step(10)
         assert sim.track[0] == "3"
+        assert sim.speed_mps[0] < 44.444 + 0.01, "braked for the crossover"
         sim.step()
         assert "1" not in set(sim.links["sender"])
+    assert orders(tmp_path / "r") == [(0.0, "x1-3_35000")]
+
+
+#: Braking as no train can: switches are locked for 160 m only, and the trains run on.
+STRONG = {"supervisor.emergency_mps2": 20.0, "supervisor.service_mps2": 20.0}
+
+
+def test_an_order_waits_for_its_place_its_speed_and_its_gap(tmp_path):
+    with trainctl.Simulation.open("three_tracks", backend="numeric", out=tmp_path / "r", **SHORT, **STRONG) as sim:
+        sim.reroute("1", crossover="leave", position_m=25000.0)
+        sim.reroute("2", crossover="leave", speed_below_mps=80.0)
+        sim.reroute("1", crossover="leave", gap_below_m=1e6)  # it leads: there is no gap
+        sim.reroute("3", crossover="leave", gap_below_m=7600.0)
+        sim.step(48)
+    trains = trainctl.open(tmp_path / "r").trains.astype({"train": str})
+    one, two, three = (trains[trains["train"] == name].set_index("time_s") for name in "123")
+    told = [(e["time_s"], e["train"]) for e in trainctl.open(tmp_path / "r").events if e["kind"] == "reroute" and e["time_s"] > 0]
+    assert told == sorted([
+        (one.index[one["position_m"] >= 25000.0][0], "1"), (two.index[two["speed_mps"] < 80.0][0], "2"),
+        (three.index[three["gap_m"] < 7600.0][0], "3"),
+    ])  # fmt: skip
+
+
+def test_what_cannot_be_followed_is_told_with_the_reason_and_changes_nothing(tmp_path):
+    with trainctl.Simulation.open("three_tracks", backend="numeric", out=tmp_path / "r", **SHORT) as sim:
+        sim.reroute("1", crossover="x1-3_25000")
+        sim.reroute("1", to_track="3")
+        sim.reroute("1", to_track="1")
+        sim.step(48)
+        assert sim.track[0] == "1"
+    (_, locked), (_, fast), (_, already) = orders(tmp_path / "r")
+    assert locked.startswith("switch x1-3_25000 at 25000.0 m is locked: 600.0 m ahead, braking takes ")
+    assert fast.startswith("crossover x1-3_35000 allows 44.444 m/s, the train runs at 85 m/s, and nobody would brake it")
+    assert already == "the train is on track 1 already"
+    assert trainctl.open(tmp_path / "r").info["status"] == "complete"
+
+
+def test_trains_of_a_configuration_step_by_step(tmp_path):
+    with trainctl.Simulation.open("merging", backend="numeric", out=tmp_path / "r", **{"run.duration_s": 60}) as sim:
+        assert sim.state["train"].tolist()[0] == "fast.0"
+        sim.reroute("fast.0", to_edge="to_north")
+        with pytest.raises(InputError, match="to_edge = to_south: no such edge"):
+            sim.reroute("fast.0", to_edge="to_south")
+        sim.step(60)
+        assert sim.track[0] == "from_west"
+    run = trainctl.open(tmp_path / "r")
+    (event,) = [e for e in run.events if e["kind"] == "reroute"]
+    assert event["to_edge"] == "to_north" and event["from_edge"] != "from_west"
+    there = run.trains.groupby("train", observed=True)["time_s"].min()
+    assert there["fast.0"] == 0.0 and 20.0 < there["branch.0"] < 40.0
+    assert "fast.2" not in there, "rows are of trains that are there"
 
 
 def test_a_continuous_law_cannot_be_commanded():
