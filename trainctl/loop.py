@@ -25,7 +25,7 @@ from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Ints, Links
 from trainctl.supervisor import applied
 from trainctl.topology import convoys, graph
 from trainctl.topology.exchange import Exchange
-from trainctl.topology.ways import Ways
+from trainctl.topology.ways import Ways, under
 from trainctl.world import Seen, Start, World, lay_out
 
 #: Slower than this is a stand [m/s].
@@ -343,6 +343,9 @@ class Simulation:
         ordered = free
         if self.service is not None:
             ordered = self.service.drive(raw, speed, view, self.stops)
+            if self.p.rails.slope.any():
+                places = own[:, POSITION] - np.repeat(self.service.offset, np.diff(self.p.consists.first))
+                self.motion.climbs(under(self.world.ways, self.p.rails.slope, raw.row, self.p.consists.first, places))
             stands = stands | self.service.standing
         if self.supervision.rules.mode == "off":
             return self._advance(t, own, ordered, disturbed, stands)
