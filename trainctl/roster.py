@@ -89,6 +89,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         for p in driving.cooperate
         if not any(fnmatch.fnmatchcase(i, p) for i in ids)
     ]
+    found += _events(scenario, ids, rails)
     trains, routes, stops = [], [], []
     for d in traffic.departures:
         try:
@@ -123,6 +124,18 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         rails=rails,
     )
     return scenario.model_copy(update={"train": tuple(trains), "train_type": types}), roster, traffic.net
+
+
+def _events(scenario: Scenario, ids: list[str], rails: Rails) -> list[str]:
+    """Orders to trains or edges that are not there."""
+    found = []
+    edges = [edge for edge, inside in zip(rails.edges, rails.internal, strict=True) if not inside]
+    for k, event in enumerate(scenario.event, 1):
+        for key, name, known, what in (("train", event.train, ids, "train"), ("to_edge", event.to_edge, edges, "edge for trains")):
+            if name is not None and name not in known:
+                some = f"{', '.join(known[:8])}{' ...' if len(known) > 8 else ''}"
+                found.append(f"event[{k}].{key} = {name}: no such {what}; there are: {some}")
+    return found
 
 
 def _types(scenario: Scenario, traffic: Traffic) -> tuple[dict[str, TrainType], list[str]]:
