@@ -159,9 +159,51 @@ def test_the_shipped_traffic_runs_under_sumo_and_its_record_is_read(tmp_path: Pa
 
 def test_trains_enter_when_and_how_they_are_told(tmp_path: Path) -> None:
     path = scenario(tmp_path, trains=3, block="moving", entry_speed_mps=60.0, entry_every_s=150.0)
-    entered = [e for e in run(path, tmp_path / "run").events if e["kind"] == "enter"]
-    told = {"kind": "enter", "track": "1", "position_m": 1000.0, "speed_mps": 60.0}
-    assert entered == [{"time_s": 150.0 * k, "train": str(k + 1), **told} for k in range(3)]
+    entered = [e for e in run(path, tmp_path / "run").events if e["kind"] == "depart"]
+    told = {"kind": "depart", "delay_s": 0.0, "track": "1", "position_m": 1000.0, "speed_mps": 60.0}
+    assert entered == [{"time_s": 150.0 * k, "planned_s": 150.0 * k, "train": str(k + 1), **told} for k in range(3)]
+
+
+def test_reroutes_come_at_their_place_and_not_inside_the_braking_distance(tmp_path: Path) -> None:
+    """From 60 m/s an ICE 3 stops within 3.6 km."""
+    # Longer than two blocks: the way over it has fewer edges.
+    over = {"id": "over", "from": "1", "to": "2", "position_m": 15000.0, "length_m": 5000.0, "speed_mps": 60.0}
+    line = {"tracks": ["1", "2"], "crossover": [over]}
+    path = scenario(tmp_path, trains=2, block="moving", line=line, entry_speed_mps=60.0, entry_every_s=200.0, top_speed_mps=60.0)
+    orders = [("1", 5000.0), ("2", 14000.0)]
+    events = "".join(f'[[event]]\nkind = "reroute"\ntrain = "{t}"\ncrossover = "over"\nposition_m = {x}\n' for t, x in orders)
+    path.write_text(path.read_text().replace("25000.0", "1000.0").replace("22000.0", "500.0") + events)
+    done = run(path, tmp_path / "run")
+    told = [(e["kind"], e["train"]) for e in done.events if e["kind"] in ("reroute", "reroute_refused", "join")]
+    assert told == [("reroute", "1"), ("join", "1"), ("reroute_refused", "2")]
+    last = done.trains.groupby("train", observed=True).last()
+    assert last["track"].to_dict() == {"1": "2", "2": "1"}
+    moved = done.trains[done.trains["train"] == "1"]["position_m"].diff().dropna()
+    assert moved.between(59.9, 60.1).all()
+
+
+def test_traffic_of_a_sumo_configuration_runs_as_it_is(tmp_path: Path) -> None:
+    """Trains depart, stop and arrive as their files say; the record is that of SUMO's own program on what we gave it."""
+    done = runner.run(open_scenario("merging", {"controller.law": "sumo", "controller.block": "moving"}), tmp_path / "run")
+    entered = {e["train"]: e for e in done.events if e["kind"] == "depart"}
+    assert set(entered) == {"fast.0", "fast.1", "fast.2", "stopping", "branch.0", "branch.1"}
+    assert [entered[f"fast.{k}"]["time_s"] for k in range(3)] == [0.0, 70.0, 140.0]
+    assert {e["train"] for e in done.events if e["kind"] == "arrive"} >= {"fast.0", "fast.1", "fast.2"}
+    trains = done.trains
+    stood = trains[(trains["train"] == "stopping") & (trains["speed_mps"] == 0.0)]
+    assert len(stood) >= 40 and stood["position_m"].nunique() == 1
+    assert not (trains["gap_m"] < 0.0).any() and done.metrics["traffic.collisions"] == 0
+    steps = trains.groupby("train", observed=True)["position_m"].diff().dropna()
+    assert steps.min() >= 0.0 and steps.max() <= 45.0  # goes on without a jump from edge to edge
+    program, environment = netconvert()
+    own = [str(program.parent / "sumo"), "-c", "run.sumocfg", "-e", "960", "--fcd-output", "own.xml", "--no-warnings"]
+    subprocess.run(own, cwd=tmp_path / "run" / "sumo", env=environment, check=True)
+    theirs = {
+        (float(step.get("time", "nan")), v.get("id")): float(v.get("speed", "nan"))
+        for step in ElementTree.parse(tmp_path / "run" / "sumo" / "own.xml").iter("timestep") for v in step
+    }  # fmt: skip
+    ours = {(row.time_s, row.train): row.speed_mps for row in trains.itertuples() if row.time_s < 960.0}
+    assert ours == pytest.approx({key: theirs[key] for key in ours}, abs=1e-6) and len(ours) == len(theirs)
 
 
 def test_trains_that_find_no_place_are_told(tmp_path: Path) -> None:
@@ -203,6 +245,19 @@ def test_what_sumo_would_not_feel_is_refused() -> None:
     assert checked is not None
     with pytest.raises(InputError, match="fault: SUMO's own trains take none"):
         prepare(checked, path.name, path.parent, found)
+
+
+def test_a_net_has_the_signals_it_has() -> None:
+    with pytest.raises(InputError) as caught:
+        open_scenario("merging", {"controller.law": "sumo", "controller.signals_m": 500.0, "controller.entry_m": 5.0})
+    assert "merging.toml: controller.entry_m: network.sumocfg says where and when its trains enter" in caught.value.mistakes
+    assert any("controller.signals_m: a net has the signals it has" in line for line in caught.value.mistakes)
+
+
+def test_fixed_block_needs_signals(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"controller.block = fixed: merging.net.xml has no rail signals"):
+        runner.run(open_scenario("merging", {"controller.law": "sumo"}), tmp_path / "run")
+    assert not (tmp_path / "run.partial").exists()
 
 
 def test_it_drives_by_itself(tmp_path: Path) -> None:

@@ -1,8 +1,9 @@
 """SUMO's own trains: no law of ours. SUMO's ``Rail`` model drives under fixed or under moving block, the baseline to compare with.
 
 SUMO decides on every speed (its default speed mode stays on), we only read: see ``trainctl.sumo.baseline``. Of the scenario it
-takes the line, the trains with their lengths, places and speeds, and the reroutes. Masses, resistances and slopes serve to tell
-what the trains' motion costs; bounds are only watched; links, plant and reference play no part, but for the top speed.
+takes the line, the trains with their lengths, places and speeds, and the reroutes; of a SUMO configuration the traffic as it is.
+Masses, resistances and slopes serve to tell what the trains' motion costs; bounds are only watched; links, plant and reference
+play no part, but for the top speed.
 
 Fixed block: one train between two signals; a train enters a block only with the braking distance ahead of it reserved. Moving
 block: the rear of the train ahead is the end of the authority, at the absolute braking distance plus 50 m; signals are there, but
@@ -25,6 +26,12 @@ OBSERVERS = ("none", "asymptotic", "intermediate")
 
 #: Distance of signals where neither the scenario nor its line states one [m].
 SIGNALS_M = 2000.0
+
+#: What SUMO brakes its train types with, on top of the running resistance [m/s2] (``MSCFModel_Rail.h``).
+BRAKING_MPS2 = {
+    "Freight": 0.3, "ICE1": 0.5, "ICE3": 0.5, "MireoPlusB": 1.1, "MireoPlusH": 1.1, "NGT400": 0.9, "NGT400_16": 0.9, "RB425": 1.0,
+    "RB628": 0.5, "REDosto7": 0.5,
+}  # fmt: skip
 
 #: Beyond this SUMO gives a block up.
 LONGEST_BLOCK_M = 20_000.0
@@ -70,8 +77,10 @@ def violations(params: Params, scene: Scene) -> list[str]:
 def unfit(scenario: Any) -> list[str]:
     """Parts of a ``scenario`` (``trainctl.scenario.Scenario``) that SUMO's own trains would not feel."""
     found = [f"{key}: SUMO's own trains take none" for key in ("disturbance", "fault") if getattr(scenario, key)]
-    if scenario.network.sumocfg is not None:
-        found.append("controller.law = sumo: not with network.sumocfg yet; SUMO runs that file itself, without trainctl")
-    if scenario.network.net is not None and scenario.controller.keys().get("signals_m") is not None:
-        found.append("controller.signals_m: network.net has the signals it has; build it with signals_m, or name its line")
+    given, network = scenario.controller.keys(), scenario.network
+    if network.line is None and given.get("signals_m") is not None:
+        found.append("controller.signals_m: a net has the signals it has; name a line, or build the net with signals_m")
+    if network.sumocfg is not None:
+        entry = [key for key in ("entry_m", "entry_speed_mps", "entry_every_s") if given.get(key)]
+        found += [f"controller.{key}: network.sumocfg says where and when its trains enter" for key in entry]
     return found
