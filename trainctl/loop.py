@@ -346,7 +346,7 @@ class Simulation:
             if self.p.rails.slope.any():
                 places = own[:, POSITION] - np.repeat(self.service.offset, np.diff(self.p.consists.first))
                 self.motion.climbs(under(self.world.ways, self.p.rails.slope, raw.row, self.p.consists.first, places))
-            stands = stands | self.service.standing
+            stands = stands | self.service.standing | self.service.halted
         if self.supervision.rules.mode == "off":
             return self._advance(t, own, ordered, disturbed, stands)
         verdict = self.supervision.verdict(view, speed)

@@ -43,6 +43,12 @@ SOON_S = 60.0
 #: A train that uncoupled does not couple again to the same one within this time [s].
 APART_S = 30.0
 
+#: Slower than this share of the cruising speed a train leads nobody: those behind draw up to it, so as not to block what is behind.
+CRAWLS = 0.25
+
+#: Slower than this a train that is not to accelerate is held [m/s]: its couplers must not move it.
+HELD_MPS = 1e-3
+
 #: Share of the haste to catch up with another formation that is left while a train behind is nearer to joining this one.
 HASTE = 0.5
 
@@ -198,7 +204,7 @@ class Service:
         self.came, self.left = np.zeros(n, bool), np.zeros(n, bool)
         self.next_stop = np.zeros(n, np.int64)
         self.stands_until = np.full(n, np.nan)  # s, while a train stands at a stop
-        self.stopping, self.stops_soon = np.zeros(n, bool), np.zeros(n, bool)
+        self.stopping, self.stops_soon, self.halted = np.zeros(n, bool), np.zeros(n, bool), np.zeros(n, bool)
         self.ask_at = np.zeros(n)
         self.parted: Ints = np.full(n, -1)  # the train each was coupled to before
         self.refused: Ints = np.full(n, -1)  # the train the law did not let each couple to, as was told
@@ -439,6 +445,7 @@ class Service:
         rate = np.minimum(np.maximum(wish, -self.driving.deceleration_mps2), lowest)
         rate = np.maximum(np.minimum(rate, self.driving.acceleration_mps2), -v / self.step)[front]
         rate = np.where(self.standing, 0.0, rate)
+        self.halted = ~led & (np.abs(speed) < HELD_MPS) & (rate <= 0.0)
         self.pace.acceleration[:] = np.where(led, rate, 0.0)
         return np.where(led, np.nan, rate)
 
@@ -447,7 +454,7 @@ class Service:
         other, wish = view.ahead.train, self.cruise.copy()
         near = np.flatnonzero(
             (other >= 0) & self.roster.cooperates & self.roster.cooperates[other] & ~self.stopping & ~self.stopping[other]
-            & ~self.standing[other] & (view.ahead.spacing <= self.driving.join_range_m) & (self.ahead != other)
+            & (v[other] > CRAWLS * self.cruise[other]) & (view.ahead.spacing <= self.driving.join_range_m) & (self.ahead != other)
         )  # fmt: skip
         j = other[near]
         error = view.ahead.spacing[near] - self.spacing.desired
