@@ -42,7 +42,10 @@ class Points:
 
     def believed_resistance(self, own: Floats) -> Floats:
         """Running resistance and gradient at the present speed and place [N/kg], shape (n,)."""
-        return point.resistance(own[:, SPEED], self.constants.davis) + point.climbing(own[:, POSITION], self.constants.gradient)
+        return point.resistance(own[:, SPEED], self.constants.davis) + self._climbing(own)
+
+    def _climbing(self, own: Floats) -> Floats:
+        return point.climbing(own[:, POSITION], self.constants.gradient) + GRAVITY * self.constants.slope
 
     def advance(
         self, k: int, t: float, own: Floats, demand: Demand, links: Links | None, exchange: Exchange, disturbed: Disturbed,
@@ -55,6 +58,10 @@ class Points:
         moved = point.advance(constants, own, asked, self.step, kick)
         mean = (moved.own[:, SPEED] - own[:, SPEED]) / self.step
         return moved.own, Motion(moved.displacement, moved.input, mean, moved.limited, moved.clipped, None, {})
+
+    def climbs(self, slope: Floats) -> None:
+        """Take the slope under every unit (U,), rise / run, for the coming step."""
+        self.constants.slope[:] = slope
 
     def saved(self) -> None:
         """Nothing changes here from step to step."""
@@ -102,10 +109,7 @@ class Units:
     def believed_resistance(self, own: Floats) -> Floats:
         """Running resistance and gradient of whole trains per mass [N/kg], shape (n,)."""
         c, v = self.p.consists, own[:, SPEED]
-        per_unit = c.davis[:, 0] + c.davis[:, 1] * v + c.davis[:, 2] * v**2
-        if len(self.gradient):
-            where = np.maximum(np.searchsorted(self.gradient[:, 0], own[:, POSITION], side="right") - 1, 0)
-            per_unit = per_unit + GRAVITY * self.gradient[where, 1]
+        per_unit = c.davis[:, 0] + c.davis[:, 1] * v + c.davis[:, 2] * v**2 + self._climbing(own)
         total: Floats = np.add.reduceat(c.mass * per_unit, c.first[:-1]) / self.masses
         return total
 
@@ -181,10 +185,18 @@ class Units:
         """Unit forces for these accelerations [N], (U,): every unit carries its own mass, resistance and weight."""
         c, v = self.p.consists, own[:, SPEED]
         per_mass = c.rotating * acceleration + np.where(v > 0.0, c.davis[:, 0] + (c.davis[:, 1] + c.davis[:, 2] * v) * v, 0.0)
-        if len(self.gradient):
-            where = np.maximum(np.searchsorted(self.gradient[:, 0], own[:, POSITION], side="right") - 1, 0)
-            per_mass = per_mass + GRAVITY * self.gradient[where, 1]
-        return np.asarray(c.mass * per_mass)
+        return np.asarray(c.mass * (per_mass + self._climbing(own)))
+
+    def _climbing(self, own: Floats) -> Floats:
+        """Weight along the track per mass [N/kg], (U,)."""
+        force: Floats = point.climbing(own[:, POSITION], self.gradient) + GRAVITY * self.plant.units[:, coupled_units.SLOPE]
+        return force
+
+    def climbs(self, slope: Floats) -> None:
+        """Take the slope under every unit (U,), rise / run, for the coming step."""
+        self.plant.units[:, coupled_units.SLOPE] = slope
+        if self.p.sampled:
+            self.loop.law.units[:, coupled_units.SLOPE] = slope
 
     def saved(self) -> Any:
         """What a step changes here, to try one."""

@@ -43,6 +43,7 @@ from trainctl.plants.coupled_units import (
     LENGTH,
     MASS,
     PUSH,
+    SLOPE,
     STIFFNESS,
     TRACTION,
     TRACTION_POWER,
@@ -58,7 +59,7 @@ from trainctl.signals import FORCE, GRAVITY, POSITION, SPEED, Consists, Floats, 
 STATES = 3
 
 #: Columns of ``Constants.units`` behind those of ``coupled_units``: actuator rate [1/s], noise in the jerk [m/s3].
-RATE, NOISE = PUSH + 1, PUSH + 2
+RATE, NOISE = SLOPE + 1, SLOPE + 2
 
 
 class Params(Table):
@@ -71,7 +72,7 @@ class Params(Table):
 
 
 class Constants(NamedTuple):
-    """The plant's constants. Columns ``PUSH`` and ``NOISE`` of ``units`` may be overwritten in place between steps."""
+    """The plant's constants. Columns ``PUSH``, ``SLOPE`` and ``NOISE`` of ``units`` may be overwritten in place between steps."""
 
     first: Ints  # (n + 1,)
     units: Floats  # as in coupled_units, then RATE, NOISE
@@ -205,7 +206,7 @@ def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, app
             rear = unit[STIFFNESS] * (own[j, POSITION] - own[j + 1, POSITION] - unit[LENGTH]) + unit[DAMPING] * closing
             damping += unit[DAMPING] * closing * closing
         drag = unit[MASS] * running_resistance(v, unit[C0], unit[C1], unit[C2])
-        weight = 0.0 if len(constants.gradient) == 0 else unit[MASS] * GRAVITY * slope_at(own[j, POSITION], constants.gradient)
+        weight = unit[MASS] * GRAVITY * (unit[SLOPE] + slope_at(own[j, POSITION], constants.gradient))
         push = unit[MASS] * unit[PUSH]
         acceleration = (tau + pull - rear - drag - weight + push) / unit[INERTIA]
         fault = fault_rate(constants.faults, a + j, t, inside) + unit[INERTIA] * unit[NOISE]

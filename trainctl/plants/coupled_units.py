@@ -30,7 +30,7 @@ STATES = 2
 
 #: Columns of ``Constants.units``; PER_INERTIA is 1 / INERTIA, since divisions took half the time of ``rate``.
 MASS, INERTIA, PER_INERTIA, C0, C1, C2, LENGTH, STIFFNESS, DAMPING = range(9)
-TRACTION, TRACTION_POWER, BRAKING, BRAKING_POWER, PUSH = range(9, 14)
+TRACTION, TRACTION_POWER, BRAKING, BRAKING_POWER, PUSH, SLOPE = range(9, 15)
 
 #: A unit that an integration step carried below standstill comes back to it at this rate [1/s].
 HOLD = 20.0
@@ -51,7 +51,7 @@ class Constants(NamedTuple):
     """What the units are and what acts on them."""
 
     first: Ints  # (n + 1,) rows of each train
-    units: Floats  # (U, 14) one column per constant named above
+    units: Floats  # (U, 15) one column per constant named above
     gradient: Floats  # (G, 2) position where a slope begins [m], rise / run; the first reaches back without end
 
 
@@ -74,14 +74,15 @@ def constants(
     Returns
     -------
     Constants
-        The column ``PUSH`` of ``units`` is a disturbing force per mass [m/s2], 0 here; it may be overwritten between steps.
+        The columns ``PUSH``, a disturbing force per mass [m/s2], and ``SLOPE``, rise / run besides that of ``gradient``,
+        are 0 here; they may be overwritten between steps.
     """
     factor = np.ones(len(consists.mass)) if resistance_factor is None else resistance_factor
     inertia = consists.mass * consists.rotating
     units = np.column_stack([
         consists.mass, inertia, 1.0 / inertia, consists.davis * factor[:, None], consists.length, consists.stiffness,
         consists.damping, consists.traction, consists.traction_power, consists.braking, consists.braking_power,
-        np.zeros(len(inertia)),
+        np.zeros(len(inertia)), np.zeros(len(inertia)),
     ])  # fmt: skip
     slopes = np.zeros((0, 2)) if gradient is None else np.ascontiguousarray(gradient, dtype=np.float64)
     return Constants(consists.first, np.ascontiguousarray(units, dtype=np.float64), slopes)
@@ -172,7 +173,7 @@ def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, app
             f = units[row, STIFFNESS] * e + units[row, DAMPING] * de
             damping += units[row, DAMPING] * de * de
         drag = m * running_resistance(v, units[row, C0], units[row, C1], units[row, C2])
-        weight = 0.0 if len(gradient) == 0 else m * GRAVITY * slope_at(own[j, POSITION], gradient)
+        weight = m * GRAVITY * (units[row, SLOPE] + slope_at(own[j, POSITION], gradient))
         push = m * units[row, PUSH]
         acceleration = (u + pull - f - drag - weight + push) * units[row, PER_INERTIA]
         out[j, POSITION] = v

@@ -51,6 +51,7 @@ class Constants(NamedTuple):
     speed_lower: Floats  # m/s
     speed_upper: Floats  # m/s
     gradient: Floats  # (G, 2) position where a slope begins [m], rise / run; the first reaches back without end
+    slope: Floats  # (n,) rise / run under every train beside that; may be overwritten between steps
 
 
 class Kick(NamedTuple):
@@ -109,6 +110,7 @@ def constants(
         speed_lower=everywhere(params.speed_lower_mps, -np.inf),
         speed_upper=everywhere(params.speed_upper_mps, np.inf),
         gradient=np.zeros((0, 2)) if gradient is None else gradient,
+        slope=np.zeros(n),
     )
 
 
@@ -178,7 +180,8 @@ def advance(constants: Constants, own: Floats, acceleration: Floats, step: float
     in two things: a displacement below zero is clipped to 0, since trains on a network do not run backwards, and the gradient.
     """
     moved = Moved(np.empty_like(own), *np.empty((2, len(own))), *np.empty((2, len(own)), dtype=bool))
-    _advance(constants, own, climbing(own[:, POSITION], constants.gradient), acceleration, step, kick, moved)
+    climb = climbing(own[:, POSITION], constants.gradient) + GRAVITY * constants.slope
+    _advance(constants, own, climb, acceleration, step, kick, moved)
     return moved
 
 

@@ -30,6 +30,7 @@ from trainctl.plants.coupled_units import (
     INERTIA,
     LENGTH,
     MASS,
+    SLOPE,
     TRACTION,
     TRACTION_POWER,
     available,
@@ -49,7 +50,7 @@ class Constants(NamedTuple):
     """What the units believe of themselves, and the acceleration they hold."""
 
     first: Ints  # (n + 1,)
-    units: Floats  # (U, 14) as in coupled_units
+    units: Floats  # (U, 15) as in coupled_units
     gradient: Floats  # (G, 2)
     acceleration: Floats  # (n,) m/s2, overwritten once per control period
     stiffness: float  # 1/s2
@@ -82,8 +83,7 @@ def demand(
         v, m = own[j, SPEED], units[row, MASS]
         f = pair(constants, row, own, j) if j < last else 0.0
         load = running_resistance(v, units[row, C0], units[row, C1], units[row, C2])
-        if len(gradient) > 0:
-            load += GRAVITY * slope_at(own[j, POSITION], gradient)
+        load += GRAVITY * (units[row, SLOPE] + slope_at(own[j, POSITION], gradient))
         base, extra = units[row, INERTIA] * a_i + m * load, pull - f
         out[j] = base + extra
         # A division only where the sum of both would leave a limit.

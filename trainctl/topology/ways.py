@@ -6,8 +6,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
+from trainctl.kernels import keep_by_sources
 from trainctl.signals import Floats, Ints
+
+keep_by_sources()  # before anything below is decorated
 
 #: Two kilometrages of one place agree to rounding.
 SAME_M = 1e-6
@@ -68,3 +72,30 @@ def rerouted(old: Ways, train: int, row: int, edges: Sequence[int] | Ints, start
         edge=np.concatenate([old.edge[:row], new, old.edge[b:]]),
         begin=np.concatenate([old.begin[:row], begins, old.begin[b:]]),
     )
+
+
+@njit(cache=True)
+def under(ways: Ways, of_edge: Floats, row: Ints, first: Ints, position: Floats) -> Floats:
+    """Value of the edge under every unit, shape (U,).
+
+    Parameters
+    ----------
+    ways : Ways
+        Of all n trains.
+    of_edge : ndarray, shape (E,)
+        Value on every edge.
+    row : ndarray, shape (n,)
+        Row in the ways of the edge each train's front is on.
+    first : ndarray, shape (n + 1,)
+        Units of train i: ``first[i]:first[i + 1]``, front first.
+    position : ndarray, shape (U,)
+        Where every unit is, as the ways count [m].
+    """
+    out = np.empty(len(position))
+    for i in range(len(row)):
+        k = row[i]
+        for u in range(first[i], first[i + 1]):
+            while k > ways.first[i] and ways.begin[k] > position[u]:
+                k -= 1
+            out[u] = of_edge[ways.edge[k]]
+    return out
