@@ -283,7 +283,11 @@ def state(simulation: Simulation) -> tuple[dict[str, Any], dict[str, Any]]:
         "own": s.own, "track": s.track, "formation": s.formation, "ahead": s.ahead, "links": s.links, "demand": s.demand,
         "relinked_own": own, "relinked_links": links, "constants": s.constants, "alarms": s.alarms.arrays(),
         "sent": tuple(s.exchange.sent), "heard": s.exchange.heard, "ever": s.exchange.ever, "outside": s.outside, "seen": seen,
+        "acting": s.supervision.acting,
     }  # fmt: skip
+    if s.lookout is not None:
+        values |= {"claims": s.lookout.claims}
+        arrays |= {"waits_for": s.lookout.waits_for}
     if isinstance(motion, Units):
         values |= {"counted": motion.counted, "sent_at": motion.air.sent_at}
         arrays |= {
@@ -313,7 +317,9 @@ def restore(simulation: Simulation, tape: Tape, saved: Saved) -> None:
     s.constants = s.p.law.constants(s.p.params, scene)
     refill("constants", s.constants, arrays)
     s.alarms.restore(values["alarms"], [arrays[f"alarms.{k}"] for k in range(len(s.alarms.arrays()))])
-    s.outside = arrays["outside"].copy()
+    s.outside, s.supervision.acting = arrays["outside"].copy(), arrays["acting"].copy()
+    if s.lookout is not None:
+        s.lookout.claims, s.lookout.waits_for = values["claims"], arrays["waits_for"].copy()
     s.exchange.heard, s.exchange.ever = arrays["heard"].copy(), arrays["ever"].copy()
     s.exchange.sent.extend(arrays[f"sent.{k}"].copy() for k in range(values["sent"]))
     motion = s.motion

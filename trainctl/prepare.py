@@ -320,7 +320,11 @@ def prepare(scenario: Scenario, file: str, folder: Path, known: Sequence[str] = 
         wrong = [line.partition(" = ")[0].partition(":")[0].rpartition(".")[2] for line in known]
         news = [line for line in found[len(known) :] if not any(f"{key} = " in line for key in wrong)]
         raise InputError([f"{file}: {line}" for line in dict.fromkeys([*known, *news])])
-    return prepared
+    if prepared.scenario.supervisor is None and trains is None:
+        return prepared
+    # What it came to is logged, so that a run can go on from its log.
+    stated = prepared.scenario.model_copy(update={"supervisor": prepared.supervision})
+    return replace(prepared, scenario=stated)
 
 
 def _in_formation(scenario: Scenario, plan: graph.Plan) -> Scenario:
