@@ -1,7 +1,7 @@
 """Every command and snippet of the pages is executed, in the order of the page, as a reader would.
 
 ``sh`` blocks line by line, ``python`` blocks in one namespace per page, ``toml`` blocks are written to the file their first line
-names. Lines that take too long or need a screen or a network are replaced: REPLACED says by what and why.
+names (``xml`` blocks too). Lines that take too long or need a screen or a network are replaced: REPLACED says by what and why.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from trainctl import cli, sweep
 from trainctl.prepare import open_scenario
 
 ROOT = Path(__file__).parents[2]
-PAGES = ("README.md", "scenarios/README.md", "sumo_net/README.md", "trainctl/controllers/README.md")
+PAGES = ("README.md", "scenarios/README.md", "sumo_net/README.md", "sumo_net/OSM.md", "trainctl/controllers/README.md")
 
 #: Line of a page -> (what is executed instead, why). None: not executed.
 REPLACED: dict[str, tuple[str | None, str]] = {
@@ -51,6 +51,8 @@ REPLACED: dict[str, tuple[str | None, str]] = {
         "trainctl sweep fully_distributed --set topology.loss=0,0.1 --set run.duration_s=8 --seeds 0..0 --backend numeric"
         " --workers 1", "300 runs take too long"),
     "trainctl sweep monte_carlo": (None, "hundreds of runs; that it can be read is tested in test_sweep.py"),
+    'export SUMO_HOME=$(python -c "import sumo; print(sumo.SUMO_HOME)")': (None, "the test knows where it is"),
+    "python $SUMO_HOME/tools/osmGet.py --bbox 9.00,47.30,9.45,47.45 --prefix region": (None, "it asks OpenStreetMap"),
     "dask scheduler --scheduler-file s.json &": (None, "a cluster; tests/regression/test_sweep.py starts one"),
     "srun dask worker --scheduler-file s.json --nthreads 1 --nworkers 1 &": (None, "the same"),
     "trainctl sweep monte_carlo --scheduler s.json": (None, "the same"),
@@ -73,11 +75,12 @@ def lines(text: str) -> list[str]:
 
 def typed(line: str, monkeypatch: pytest.MonkeyPatch) -> int:
     """Exit code of a command line; ours run in this process, which is quicker."""
-    words = shlex.split(line)
-    if words[0] != "trainctl" or words[1] == "sweep":  # Dask starts processes and warns of a port that is taken
-        from sumo import SUMO_HOME
+    from sumo import SUMO_HOME
 
+    words = shlex.split(line.replace("$SUMO_HOME", SUMO_HOME))
+    if words[0] != "trainctl" or words[1] == "sweep":  # Dask starts processes and warns of a port that is taken
         programs = os.environ | {
+            "SUMO_HOME": SUMO_HOME,
             "PATH": os.pathsep.join((f"{SUMO_HOME}/bin", str(Path(sys.executable).parent), os.environ["PATH"]))
         }
         return subprocess.run(words, env=programs, check=False, stdout=subprocess.DEVNULL).returncode
@@ -124,8 +127,12 @@ def test_every_block_of_the_page_runs(page, tmp_path, monkeypatch, capfd):
                 exec(compile(text, page, "exec"), names)
             elif language == "toml":
                 checked(text, tmp_path)
+            elif language == "xml":
+                (tmp_path / re.match(r"<!-- (\S+) -->\n", text)[1]).write_text(text)
             else:
                 raise AssertionError(f"{page}: a block in {language}: how is it executed?")
+    if page == "sumo_net/OSM.md":
+        assert '"kind":"couple"' in (tmp_path / "runs/region/events.jsonl").read_text(), "the page ends in a running formation"
 
 
 def test_replacements_are_of_lines_that_exist():
