@@ -9,13 +9,14 @@ bare               SUMO stepping the trains, each at the constant commanded spee
 rail               SUMO's own ``Rail`` model drives the same trains on the same net
 loop               ours: ``fully_distributed`` on point trains, everything recorded
 traci              the same loop through TraCI, SUMO in a process of its own
+client             TraCI as people write it: three reads and one command per train and step, no law, no records
 coupled_units      numeric: ``fully_distributed`` on trains of four units, sub-steps of 10 ms
 finite_time        numeric: ``emu_finite_time`` on the same trains
 actuated_units     numeric: ``fault_tolerant`` with its observer on trains of four units with actuators
 =================  ===============================================================================================================
 
 The net is fixed: three parallel tracks cut into edges of 5 km, ``bench_three_tracks``, as long as the trains need. The outputs of
-SUMO are those of a run (``trainctl.sumo.session.OPTIONS``) in bare, rail, loop and traci. A figure is the time from the first step
+SUMO are those of a run (``trainctl.sumo.session.OPTIONS``) in all cases with SUMO. A figure is the time from the first step
 until the logs are closed, per train and step [us]; ``peak_mb`` is the peak resident memory of the process that steps. Time of the
 processor is told too (``cpu_``, all threads): where others use the machine it is the truer figure.
 """
@@ -31,21 +32,22 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 SIZES = (10, 100, 1000, 10_000)
-IN_SUMO = ("bare", "rail", "loop", "traci")
+IN_SUMO = ("bare", "rail", "loop", "traci", "client")
+ALONE = ("bare", "rail", "client")  # without our loop
 NUMERIC = ("coupled_units", "finite_time", "actuated_units")
 PARTS = ("read", "topology", "control", "plant", "write", "step", "record")
 SPEED_MPS = 80.0
 SPACING_M = dict.fromkeys((*IN_SUMO, *NUMERIC), 500.0) | {"finite_time": 900.0, "actuated_units": 900.0}
 
 #: Train-steps of one repeat, about; the slower a case, the fewer.
-WORK = {"traci": 15_000, "coupled_units": 15_000, "finite_time": 15_000, "actuated_units": 9_000}
-IN_SUMO_WORK = 200_000
+WORK = {"traci": 15_000, "client": 10_000, "coupled_units": 15_000, "finite_time": 15_000, "actuated_units": 9_000}
+IN_SUMO_WORK = 120_000
 
 
 def steps_of(case: str, trains: int) -> int:
@@ -255,6 +257,29 @@ def alone(folder: Path, case: str, steps: int) -> dict[str, Any]:
     return {"trains": len(names), "seconds": [spent], "cpu": [cpu], "parts": {"step": spent}, "peak_mb": peak_mb()}
 
 
+def client(folder: Path, steps: int) -> dict[str, Any]:
+    """A loop around SUMO through TraCI that asks for and commands one train after the other."""
+    api = through_traci()
+    api.start(json.loads((folder / "command.json").read_text(encoding="utf-8")))
+    api.simulationStep()
+    vehicle, names, clock = api.vehicle, api.vehicle.getIDList(), Clock()
+    for name in names:
+        vehicle.setSpeedMode(name, 32)
+    began, busy = time.perf_counter(), time.process_time()
+    for _ in range(steps):
+        with clock.part("read"):
+            seen = {name: (vehicle.getRoadID(name), vehicle.getLanePosition(name), vehicle.getSpeed(name)) for name in names}
+        with clock.part("write"):
+            for name, (_, _, speed) in seen.items():
+                vehicle.setSpeed(name, speed)
+        with clock.part("step"):
+            api.simulationStep()
+    with clock.part("step"):
+        api.close()
+    spent, cpu = time.perf_counter() - began, time.process_time() - busy + sum(os.times()[2:4])
+    return {"trains": len(names), "seconds": [spent], "cpu": [cpu], "parts": clock.spent, "peak_mb": peak_mb()}
+
+
 def closed(folder: Path, case: str, steps: int) -> dict[str, Any]:
     """Our loop: in SUMO, through TraCI, or numeric."""
     if case == "traci":
@@ -267,7 +292,7 @@ def closed(folder: Path, case: str, steps: int) -> dict[str, Any]:
     if case == "finite_time":
         from trainctl.controllers import emu_finite_time
 
-        emu_finite_time.REHEARSAL_STEPS = 1  # the check of the start takes 40 ms per train, and is not what is measured
+        emu_finite_time.REHEARSAL_STEPS = 1  # the check of the start takes 10 ms per train, and is not what is measured
     prepared = open_scenario(str(folder / "scenario.toml"))
     clock = Clock()
     journal = Journal(folder, prepared)
@@ -336,8 +361,11 @@ def through_traci() -> Any:
 
 def child(case: str, folder: Path, steps: int) -> None:
     """What runs in a process of its own; prints one JSON object."""
-    function: Callable[..., dict[str, Any]] = alone if case in ("bare", "rail") else closed
-    print(json.dumps(function(folder, case, steps)))
+    if case == "client":
+        result = client(folder, steps)
+    else:
+        result = (alone if case in ALONE else closed)(folder, case, steps)
+    print(json.dumps(result))
 
 
 # All cases
@@ -360,7 +388,7 @@ def place(root: Path, case: str, trains: int) -> Path:
         text, line = scenario(case, trains, steps + 2)
         (folder / "scenario.toml").write_text(text, encoding="utf-8")
         (folder / "line.toml").write_text(line, encoding="utf-8")
-        if case in ("bare", "rail"):
+        if case in ALONE:
             python("--inputs", case, str(folder), str(trains), str(steps))
     for old in ("sumo", "segments"):
         shutil.rmtree(folder / old, ignore_errors=True)
@@ -381,7 +409,7 @@ def bench(root: Path, sizes: list[int], cases: list[str], repeats: int) -> list[
         found: dict[str, list[dict[str, Any]]] = {case: [] for case in cases}
         for turn in range(repeats):
             for case in cases:
-                if turn == 0 or case in IN_SUMO:  # the numeric ones repeat within one process
+                if turn == 0 or (case in IN_SUMO and case != "client"):  # the numeric ones repeat within one process
                     print(f"{trains} trains, {case}, {turn + 1}", file=sys.stderr)
                     found[case].append(measure(root, case, trains))
         rows += [row(case, trains, results) for case, results in found.items()]
