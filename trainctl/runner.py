@@ -93,7 +93,8 @@ def run(
             raise InputError("controller.law = sumo: SUMO drives by itself: no --backend numeric, --gui or --checkpoint-every")
         from trainctl.sumo import baseline
 
-        return baseline.run(p, out, force, command_line, progress)
+        with _stops():
+            return baseline.run(p, out, force, command_line, progress)
     with opened(p, out, backend, force, command_line, gui, checkpoint_every_s) as simulation:
         simulation.run(progress)
     return Run(out)

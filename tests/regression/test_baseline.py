@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
@@ -14,11 +16,12 @@ import pytest
 
 from sumo_net.build import netconvert
 from trainctl import capacity, runner
-from trainctl.errors import InputError
+from trainctl.errors import InputError, SimulatorError
 from trainctl.prepare import open_scenario
 from trainctl.reading import examine
 from trainctl.record.run import Run
 from trainctl.signals import GRAVITY
+from trainctl.sumo.baseline import Session
 
 SECTION = 24000.0
 
@@ -258,6 +261,26 @@ def test_fixed_block_needs_signals(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"controller.block = fixed: merging.net.xml has no rail signals"):
         runner.run(open_scenario("merging", {"controller.law": "sumo"}), tmp_path / "run")
     assert not (tmp_path / "run.partial").exists()
+
+
+@pytest.mark.parametrize("how", ["failed", "interrupted"])
+def test_what_was_recorded_stays_if_the_run_does_not_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
+    read = Session._read
+
+    def trouble(self: Session) -> Any:
+        if self.k == 30 and how == "interrupted":
+            os.kill(os.getpid(), signal.SIGTERM)
+        elif self.k == 30:
+            raise SimulatorError("it broke")
+        return read(self)
+
+    monkeypatch.setattr(Session, "_read", trouble)
+    with pytest.raises(SimulatorError if how == "failed" else KeyboardInterrupt):
+        run(scenario(tmp_path), tmp_path / "run")
+    left = Run(tmp_path / "run.partial")
+    assert (left.info["status"], left.info["steps"], left.info["failure"]["time_s"]) == (how, 30, 30.0)
+    assert left.trains["time_s"].max() == 29.0
+    run(scenario(tmp_path), tmp_path / "again", **{"run.duration_s": 20.0})  # SUMO was ended: it starts again
 
 
 def test_it_drives_by_itself(tmp_path: Path) -> None:
