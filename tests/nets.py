@@ -159,19 +159,23 @@ def three_joins(folder: Path) -> None:
     )
 
 
-def single_track(folder: Path, number: int = 3) -> None:
-    """Single track with a passing loop in the middle, trains both ways."""
+def single_track(folder: Path, body: str) -> None:
+    """Single track from ``a`` to ``b`` with two passing loops: ``UP`` and ``DOWN`` are the ways."""
+    loops = {}
+    for k, (begin, x) in enumerate((("1", 6000), ("3", 14000)), 1):
+        end = str(int(begin) + 1)
+        for name, ends, side in ((f"up{k}", (begin, end), 20), (f"down{k}", (end, begin), -20)):
+            shape = [f"{x},0", f"{x + 200},{side}", f"{x + 1800},{side}", f"{x + 2000},0"]
+            loops[name] = (*ends, {"shape": " ".join(shape if side > 0 else shape[::-1])})
     net(
         folder,
-        {"a": (0, 0), "1": (6000, 0), "2": (8000, 0), "b": (14000, 0)},
-        {**both_ways("left", "a", "1"), "up": ("1", "2", {"shape": "6000,0 6200,20 7800,20 8000,0"}),
-         "down": ("2", "1", {"shape": "8000,0 7800,-20 6200,-20 6000,0"}), **both_ways("right", "2", "b")},
-    )  # fmt: skip
-    traffic(
-        folder,
-        flow("east", "left up right", number, 600, departSpeed="0")
-        + flow("west", "-right down -left", number, 600, departSpeed="0"),
+        {"a": (0, 0), "1": (6000, 0), "2": (8000, 0), "3": (14000, 0), "4": (16000, 0), "b": (22000, 0)},
+        {**both_ways("left", "a", "1"), **both_ways("middle", "2", "3"), **both_ways("right", "4", "b"), **loops},
     )
+    traffic(folder, body)
+
+
+UP, DOWN = "left up1 middle up2 right", "-right down2 -middle down1 -left"
 
 
 def diamond(folder: Path) -> None:
@@ -220,17 +224,16 @@ def limits(folder: Path) -> None:
     traffic(folder, flow("t", "ab bc cd de ef", 5, 45))
 
 
-def crowd(folder: Path, number: int = 50) -> None:
-    """Many trains, pairs of them departing in one instant from the same edge, of two types."""
+def crowd(folder: Path, number: int = 50, period: float = 70.0) -> None:
+    """Many trains of two types and lengths; pairs depart in one instant, now and then from the same edge."""
     net(
         folder,
         {"a": (0, 0), "b": (9000, 0), "c": (0, -2000), "d": (40000, 0)},
         {"ab": ("a", "b"), "cb": ("c", "b"), "bd": ("b", "d")},
     )
-    types = "".join(f'<vType id="{k}" vClass="rail" length="{x}" maxSpeed="45"/>' for k, x in (("emu", 100), ("long", 100)))
+    types = "".join(f'<vType id="{k}" vClass="rail" length="{x}" maxSpeed="45"/>' for k, x in (("emu", 100), ("long", 250)))
     half = number // 2
-    body = flow("a", "ab bd", half, 70) + flow("c", "cb bd", number - half, 70, type="long")
-    traffic(folder, body, types)
+    traffic(folder, flow("a", "ab bd", half, period) + flow("c", "cb bd", number - half, period, type="long"), types)
 
 
 def separate(folder: Path) -> None:

@@ -336,9 +336,10 @@ class Service:
         for i in self._too_slow().tolist():
             self._part(i, t, "the reference falls below what the law can hold", journal)
         free = convoys.candidates(self.ahead, view.ahead.train, along.behind(view.ahead).train, willing & ~self.stops_soon)
-        for i in free[(self.ask_at[free] <= t) & ~self._slows_soon(own, view)[free]].tolist():
+        free = free[(self.ask_at[free] <= t) & ~self._slows_soon(own, view)[free]]
+        for i in free[self._fits(free, view, own)].tolist():
             j, spacing = int(view.ahead.train[i]), float(view.ahead.spacing[i])
-            if self._fits(i, j, spacing, own) and convoys.fronts(self.ahead)[j] != i:
+            if convoys.fronts(self.ahead)[j] != i:
                 self.ask_at[i] = t + ASK_AGAIN_S
                 reasons = self._try(i, j, spacing, t, own)
                 if not reasons:
@@ -354,19 +355,22 @@ class Service:
         self.pace.acceleration[alone] = 0.0
         return changed
 
-    def _fits(self, i: int, j: int, spacing: float, own: Floats) -> bool:
-        """Whether spacing and speeds are right for coupling."""
-        p, d = self.p, self.driving
-        speed = own[p.heads, SPEED]
-        inside = all(p.bounds.speed_lower[k] < speed[k] < p.bounds.speed_upper[k] for k in (i, j))
-        predicted = spacing + (speed[j] - speed[i]) * (p.scenario.run.control_period_s or self.step)
-        return (
-            inside
-            and abs(spacing - self.spacing.desired) <= d.join_band_m
-            and self.spacing.lower <= min(spacing, predicted)
-            and max(spacing, predicted) <= self.spacing.upper
-            and abs(speed[i] - speed[j]) <= d.join_band_mps
+    def _fits(self, trains: Ints, view: View, own: Floats) -> Bools:
+        """Whether spacing and speeds of these trains (k,) and those ahead of them are right for coupling."""
+        p, d, speed = self.p, self.driving, own[self.p.heads, SPEED]
+        inside = (p.bounds.speed_lower < speed) & (speed < p.bounds.speed_upper)
+        ahead, spacing = view.ahead.train[trains], view.ahead.spacing[trains]
+        closing = speed[ahead] - speed[trains]
+        predicted = spacing + closing * (p.scenario.run.control_period_s or self.step)
+        fits: Bools = (
+            inside[trains]
+            & inside[ahead]
+            & (np.abs(spacing - self.spacing.desired) <= d.join_band_m)
+            & (self.spacing.lower <= np.minimum(spacing, predicted))
+            & (np.maximum(spacing, predicted) <= self.spacing.upper)
+            & (np.abs(closing) <= d.join_band_mps)
         )
+        return fits
 
     def _try(self, i: int, j: int, spacing: float, t: float, own: Floats) -> list[str]:
         """Couple ``i`` to ``j`` if the law's start condition holds for the longer formation; returns what it objects to."""

@@ -47,7 +47,7 @@ def order_at(run: Run, edge: str) -> list[str]:
 @pytest.mark.parametrize("law", nets.LAWS)
 def test_trains_of_two_branches_join_in_one_formation(tmp_path, law):
     nets.branches(tmp_path, number=1)
-    found = go(tmp_path, nets.scenario(law, 700))
+    found = go(tmp_path, nets.scenario(law, 400))
     unharmed(found, arrive=False)
     [couple] = [e for e in found.events if e["kind"] == "couple"]
     assert (couple["train"], couple["ahead"]) == ("s.0", "w.0")
@@ -65,3 +65,103 @@ def test_joins_and_branchings_with_and_without_internal_edges(tmp_path, options)
     unharmed(found)
     assert kinds(found)["couple"] >= 3
     assert order_at(found, "main") == ["w.0", "s.0", "w.1", "s.1", "w.2", "s.2"]
+
+
+def test_backends_agree_where_trains_come_join_and_leave(tmp_path):
+    nets.branches(tmp_path)
+    tables = nets.scenario("fully_distributed", 1500)
+    coupled, numeric = go(tmp_path, tables).trains, go(tmp_path, tables, "numeric").trains
+    assert len(coupled) == len(numeric)
+    assert np.max(np.abs(coupled.position_m - numeric.position_m)) < 1e-6
+    assert np.max(np.abs(coupled.speed_mps - numeric.speed_mps)) < 1e-9
+
+
+def test_three_joins_one_after_the_other(tmp_path):
+    nets.three_joins(tmp_path)
+    found = go(tmp_path, nets.scenario("robust_constrained", 2800))
+    unharmed(found)
+    assert kinds(found)["couple"] >= 8
+    pairs = [(e["train"], e["ahead"]) for e in found.events if e["kind"] == "couple"]
+    assert len(set(pairs)) == len(pairs)  # nobody couples to the same train again and again
+
+
+@pytest.mark.parametrize("period", [60, 240])
+def test_opposing_trains_meet_in_passing_loops(tmp_path, period):
+    up = nets.flow("up", nets.UP, 3, period, departSpeed="0")
+    nets.single_track(tmp_path, up + nets.flow("down", nets.DOWN, 3, period, 20, departSpeed="0"))
+    found = go(tmp_path, nets.scenario("robust_constrained", 3000))
+    unharmed(found)
+    assert any(e["kind"] == "conflict" and e["place"] == "single_track" for e in found.events)
+
+
+def test_two_lines_cross_on_the_level(tmp_path):
+    nets.diamond(tmp_path)
+    found = go(tmp_path, nets.scenario("robust_constrained", 1100))
+    unharmed(found)
+    assert kinds(found)["conflict"] > 0
+
+
+def test_a_train_that_stops_leaves_its_formation_and_another_joins(tmp_path):
+    nets.station(tmp_path)
+    found = go(tmp_path, nets.scenario("robust_constrained", 2000))
+    unharmed(found)
+    stops = {e["train"]: e for e in found.events if e["kind"] == "stop_reached"}
+    left = {e["train"]: e["time_s"] for e in found.events if e["kind"] == "stop_left"}
+    assert set(stops) == set(left) == {"stops", "until"}
+    assert all(abs(e["short_m"]) < 0.01 for e in stops.values())
+    assert left["stops"] - stops["stops"]["time_s"] == 60.0
+    assert left["until"] == max(650.0, stops["until"]["time_s"] + 10.0)
+    assert kinds(found)["couple"] >= 2
+
+
+def test_trains_run_round_a_ring(tmp_path):
+    nets.ring(tmp_path)
+    unharmed(go(tmp_path, nets.scenario("robust_constrained", 2600)))
+
+
+@pytest.mark.parametrize("law", ["fully_distributed", "robust_constrained"])
+def test_a_formation_follows_the_limits_as_long_as_its_law_can(tmp_path, law):
+    nets.limits(tmp_path)
+    found = go(tmp_path, nets.scenario(law, 2400))
+    unharmed(found)
+    for edge, limit in (("bc", 34.5), ("de", 20.0)):
+        rows = found.trains[found.trains.edge.astype(str) == edge]
+        assert rows.speed_mps.max() < limit + 1e-9
+    reasons = {e["reason"] for e in found.events if e["kind"] == "uncouple"}
+    assert ("the reference falls below what the law can hold" in reasons) == (law == "fully_distributed")
+
+
+def test_lines_that_have_nothing_to_do_with_each_other(tmp_path):
+    nets.separate(tmp_path)
+    found = go(tmp_path, nets.scenario("robust_constrained", 1100))
+    unharmed(found)
+    assert kinds(found)["couple"] >= 4
+    assert all(e["train"][0] == e["ahead"][0] for e in found.events if e["kind"] == "couple")
+
+
+@pytest.mark.parametrize(("step", "control"), [(0.2, None), (0.2, 5.0), (1.0, 8.0)])
+def test_other_steps_and_control_periods(tmp_path, step, control):
+    nets.branches(tmp_path, number=1)
+    law = "robust_constrained" if control is None else "fully_distributed"
+    changed = {"run": {"step_s": step, "control_period_s": control}} if control else {"run": {"step_s": step}}
+    if control is None:
+        changed["controller"] = {"h_per_s": 0.1}
+    found = go(tmp_path, nets.scenario(law, 320, **changed))
+    unharmed(found, arrive=False)
+    assert kinds(found)["couple"] == 1
+
+
+def test_only_those_that_cooperate_couple(tmp_path):
+    nets.branches(tmp_path)
+    found = go(tmp_path, nets.scenario("robust_constrained", 900, traffic={"cooperate": ["w.*"]}))
+    unharmed(found, arrive=False)
+    assert {e["train"][0] + e["ahead"][0] for e in found.events if e["kind"] == "couple"} <= {"ww"}
+
+
+def test_fifty_trains_of_two_lengths_couple_and_arrive(tmp_path):
+    nets.crowd(tmp_path)
+    tables = nets.scenario("robust_constrained", 3800, types=("emu", "long"))
+    tables["train_type"]["long"] = tables["train_type"]["long"] | {"unit_length_m": 250.0}
+    found = go(tmp_path, tables)
+    unharmed(found)
+    assert kinds(found)["couple"] >= 45
