@@ -236,7 +236,7 @@ def test_both_ways_at_one_place_and_crossovers_end_to_end_are_allowed():
 
 def test_the_shipped_lines_are_right():
     shipped = sumo_net.shipped()
-    assert set(shipped) == {"three_tracks", "single_track"}
+    assert set(shipped) == {"three_tracks", "single_track", "fast_crossovers"}
     specs: dict[str, LineSpec] = {name: read_spec(path) for name, path in shipped.items()}
     assert all(spec.name == name for name, spec in specs.items())
     three = specs["three_tracks"]
