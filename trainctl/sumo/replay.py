@@ -8,15 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 import sumo_net
-from sumo_net import Line, LineError
+from sumo_net import Line, LineError, Rails
 from trainctl.errors import InputError, SimulatorError
 from trainctl.reading import examine
 from trainctl.record.run import Run
+from trainctl.roster import chart
 from trainctl.scenario import Scenario
 from trainctl.signals import Bools, Floats, Ints, Links
-from trainctl.sumo.gui import Gui
+from trainctl.sumo.gui import Gui, Map
+from trainctl.topology import graph
 from trainctl.world import Start
 
 
@@ -49,6 +53,8 @@ def replay(run: Run, binary: str = "sumo-gui", from_s: float = 0.0, delay_ms: fl
     scenario, _ = examine(run.scenario, resolved=True)
     if scenario is None:
         raise InputError(f"{run.folder}: its scenario.toml is damaged")
+    if scenario.network.sumocfg is not None:
+        return _traffic(run, scenario, binary, from_s, delay_ms)
     ids = list(scenario.ids)
     trains = run.trains
     trains = trains[trains["time_s"] >= from_s - 1e-9]
@@ -74,9 +80,89 @@ def replay(run: Run, binary: str = "sumo-gui", from_s: float = 0.0, delay_ms: fl
     return len(times) - 1
 
 
-def _grid(trains: pd.DataFrame, column: str, ids: list[str]) -> np.ndarray:
-    """A column as rows of instants, columns of trains."""
-    return trains.pivot(index="time_s", columns="train", values=column)[ids].to_numpy()
+def _traffic(run: Run, scenario: Scenario, binary: str, from_s: float, delay_ms: float) -> int:
+    """The same for trains that come and go: as SUMO's own log has them, edge by edge."""
+    log = run.folder / "sumo" / "fcd.parquet"
+    nets = sorted((run.folder / "sumo").glob("*.net.xml"))
+    if not nets or not log.is_file():
+        raise InputError(f"{run.folder}: made without SUMO, which alone knows where its net lies: run it with SUMO to see it")
+    columns = {"timestep_time": "time_s", "vehicle_id": "train", "vehicle_lane": "lane", "vehicle_pos": "m", "vehicle_speed": "v"}
+    try:
+        seen = pd.DataFrame(pq.read_table(log, columns=list(columns)).to_pandas()).rename(columns=columns)
+        rails = Rails.read(nets[0])
+    except (pa.ArrowException, OSError) as error:
+        raise InputError(f"{log}: cannot be read: {str(error).partition(chr(10))[0]}") from None
+    except LineError as error:
+        raise InputError(error.mistakes) from None
+    seen = seen[seen["train"].notna() & (seen["time_s"] >= from_s - 1e-9)]
+    times = np.unique(seen["time_s"].to_numpy())
+    if len(times) < 2:
+        raise InputError(f"{run.folder}: fewer than two instants recorded from {from_s:g} s on")
+    step = scenario.run.step_s
+    times = times[0] + step * np.arange(1 + round(float(times[-1] - times[0]) / step))
+    ids = [i for i in scenario.ids if i in set(seen["train"])]
+    number = {name: i for i, name in enumerate(ids)}
+    train, row = seen["train"].map(number).to_numpy(), np.round((seen["time_s"].to_numpy() - times[0]) / step).astype(np.int64)
+    speed, edge = np.full((len(times), len(ids)), np.nan), np.full((len(times), len(ids)), -1)
+    speed[row, train] = seen["v"].to_numpy()
+    edge[row, train] = seen["lane"].astype(str).str.rpartition("_")[0].map(rails.index).to_numpy()
+    there = edge >= 0
+    first = np.argmax(there, axis=0)
+    places = seen.drop_duplicates("train").set_index("train").loc[ids]
+    kept = [scenario.ids.index(name) for name in ids]
+    consists = scenario.consists()
+    ways = [_way(rails, edge[there[:, i], i].tolist()) for i in range(len(ids))]
+    start = Start(
+        ids=ids, edge=np.array([way[0] for way in ways]), lane_position=places["m"].to_numpy(), speed=speed[first, range(len(ids))],
+        length=consists.train_length()[kept],
+        unit_length=[consists.length[consists.first[k] : consists.first[k + 1]] for k in kept],
+        routes=[tuple(rails.edges[e] for e in way) for way in ways], present=first == 0, vclass=["rail"] * len(ids),
+    )  # fmt: skip
+    position = _grid(run.trains, "position_m", ids, times)
+    links = _changes(run, times, ids, np.zeros_like(edge), np.nan_to_num(position, nan=-np.inf))
+    with tempfile.TemporaryDirectory(prefix="replay.") as scratch:
+        net = Path(scratch) / nets[0].name
+        net.write_bytes(nets[0].read_bytes())
+        gui = Map(chart(rails), net, Path(scratch), step, len(times), binary, delay_ms)
+        try:
+            gui.start(start)
+            for k, now in enumerate(times[:-1].tolist()):
+                if now in links:
+                    gui.linked(*_formations(links[now][0]))
+                for i in np.flatnonzero(first == k + 1).tolist():
+                    gui.insert(i, float(speed[k + 1, i]))
+                # Who is gone by the next instant has left at the end of its way.
+                gone = np.where(there[k], np.nan_to_num(speed[k]) * step + float(rails.length_m.max()), 0.0)
+                gui.move(np.where(there[k] & there[k + 1], np.nan_to_num(speed[k + 1]) * step, gone), step)
+        finally:
+            gui.close()
+    return len(times) - 1
+
+
+def _way(rails: Rails, seen: list[int]) -> list[int]:
+    """The edges of a train that was seen on these: a short one may have been passed between two instants."""
+    way = [seen[0]]
+    for here, there in pairwise(seen):
+        if here != there:
+            path = rails.path(here, there)
+            if path is None:
+                raise SimulatorError(f"recorded edges {rails.edges[here]} and {rails.edges[there]} do not follow each other")
+            way += path[1:].tolist()
+    return way
+
+
+def _formations(links: Links) -> tuple[Links, Ints]:
+    """Links with the trains in the order of their formations, and the formation of every train: those who are connected."""
+    formation = np.arange(len(links.order))
+    for group in graph.components(len(formation), links.sender, links.receiver):
+        formation[list(group)] = min(group)
+    return links._replace(order=links.order[np.argsort(formation[links.order], kind="stable")]), formation
+
+
+def _grid(trains: pd.DataFrame, column: str, ids: list[str], times: Floats | None = None) -> np.ndarray:
+    """A column as rows of instants (``times``, or all there are), columns of trains."""
+    grid = trains.pivot(index="time_s", columns="train", values=column)[ids]
+    return (grid if times is None else grid.reindex(times)).to_numpy()
 
 
 def _network(run: Run, scenario: Scenario, folder: Path) -> tuple[Line, Path]:
