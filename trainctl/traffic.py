@@ -213,11 +213,12 @@ def read_traffic(sumocfg: Path, work: Path, end_s: float | None = None, seed: in
     expanded = _expand(trains, demand, net[0], work, begin, min(ends) if ends else None, seed)
     order = {train.get("id", ""): k for k, train in enumerate(trains)}
     made = {vehicle.get("id", "") for vehicle in expanded}
+    made |= {name.rpartition(".")[0] for name in made}
     departures = []
     wrong = [
-        f"train {t.get('id')}: duarouter makes no route of it"
+        f"{'flow' if t.tag == 'flow' else 'train'} {t.get('id')}: duarouter makes no route of it; are all its edges for its vClass?"
         for t in trains
-        if t.tag != "flow" and t.get("id") not in made and begin <= _departs(t, begin) < min(ends, default=math.inf)
+        if t.get("id") not in made and _comes(t, begin, min(ends, default=math.inf))
     ]
     for vehicle in expanded:
         name = vehicle.get("id", "")
@@ -312,6 +313,14 @@ def _seconds(text: str) -> float:
 def _departs(train: Element, begin: float) -> float:
     depart = train.get("depart", "begin")
     return begin if depart == "begin" else _seconds(depart)
+
+
+def _comes(train: Element, begin: float, end: float) -> bool:
+    """Whether a train, or one of a flow, must depart between these times; of a flow that is drawn nobody can tell."""
+    if train.tag != "flow":
+        return begin <= _departs(train, begin) < end
+    sure = train.get("number", "1") != "0" and "probability" not in train.attrib
+    return sure and begin <= _seconds(train.get("begin", "0")) < min(end, _seconds(train.get("end", "inf")))
 
 
 def _is_number(text: str) -> bool:
@@ -627,6 +636,7 @@ def _expand(
         "output-file": "trains.rou.xml",
         "begin": f"{begin:.3f}", "seed": str(seed), "precision": "9", "xml-validation": "never", "no-step-log": "true",
         "unsorted-input": "true", "ignore-errors": "true",
+        "skip-new-routes": "true",  # otherwise it draws between the route a train is given and a shorter one
     }  # fmt: skip
     if any(key.endswith(("Junction", "Junctions")) for train in trains for key in train.keys()):  # noqa: SIM118
         options["junction-taz"] = "true"

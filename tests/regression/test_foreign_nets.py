@@ -114,9 +114,13 @@ def test_a_train_that_stops_leaves_its_formation_and_another_joins(tmp_path):
     assert kinds(found)["couple"] >= 2
 
 
-def test_trains_run_round_a_ring(tmp_path):
+def test_trains_run_round_a_ring_twice(tmp_path):
     nets.ring(tmp_path)
-    unharmed(go(tmp_path, nets.scenario("robust_constrained", 2600)))
+    found = go(tmp_path, nets.scenario("robust_constrained", 2800))
+    unharmed(found)
+    rows = found.trains[found.trains.edge.astype(str) == "cd"]
+    for _, times in rows.groupby("train", observed=True).time_s:
+        assert (times.diff() > 1.0).sum() == 1  # away from there just once: twice there
 
 
 @pytest.mark.parametrize("law", ["fully_distributed", "robust_constrained"])

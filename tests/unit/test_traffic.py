@@ -273,7 +273,10 @@ MISTAKES = {
     ],
     f'{V} route="main" departSpeed="-1"/>': ["train v: departSpeed = -1: must not be negative"],
     f"{V}/>": ["train v: no route"],
-    f'{V}><route edges="zx"/></vehicle>': ["train v: is not allowed to depart on edge zx"],
+    f'{V}><route edges="zx"/></vehicle>': ["train v: duarouter makes no route of it; are all its edges for its vClass?"],
+    '<flow id="v" type="t" begin="0" end="9" number="2"><route edges="zx"/></flow>': [
+        "flow v: duarouter makes no route of it; are all its edges for its vClass?"
+    ],
     f'{V} route="main"><stop duration="4"/></vehicle>': ["train v: a stop has neither a lane nor an edge nor a place to stop at"],
     f'{V} route="main"/>{V} route="main"/>': ["train v: there are several of this id"],
     '<vType id="bad" vClass="rail" length="long"/>': ["vType bad: length = long: must be a number, not negative"],
