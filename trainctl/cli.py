@@ -170,6 +170,8 @@ def _summary(done: Run, prepared: Prepared) -> None:
     table.add_row("bounds", "all held" if not broken else f"{broken} broken{where}: see kind = violation in events.jsonl")
     table.add_row("results", f"{done.folder}/  (trainctl plot {done.folder}; trainctl metrics {done.folder})")
     _print(table)
+    for note in () if prepared.roster is None else prepared.roster.notes:
+        print(f"warning: {note}")
 
 
 @app.command("list")

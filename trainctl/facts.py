@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,9 @@ from trainctl.plants import shared
 from trainctl.prepare import Prepared
 from trainctl.topology import graph
 
+#: More trains than this are counted, not named.
+MOST = 40
+
 
 def facts(p: Prepared) -> dict[str, Any]:
     """Facts by name, ``warnings`` and the law's ``report`` (both lists of lines)."""
@@ -17,11 +21,13 @@ def facts(p: Prepared) -> dict[str, Any]:
     links = graph.edges(scene.links, p.scenario.ids)
     found: dict[str, Any] = {
         "title": p.scenario.title,
-        "trains": ", ".join(p.scenario.ids),
+        "trains": _some(p.scenario.ids),
         "law": f"{p.scenario.controller.law} ({p.law.CLOCK})",
         "plant": p.scenario.plant.kind,
-        "line": f"{p.line.begin_m / 1000:g} .. {p.line.end_m / 1000:g} km, tracks {', '.join(p.line.track_ids)}",
-        "links_at_start": " ".join(f"{a}-{b}" for a, b in links),
+        **(_traffic(p) if p.roster is not None else {
+            "line": f"{p.line.begin_m / 1000:g} .. {p.line.end_m / 1000:g} km, tracks {', '.join(p.line.track_ids)}",
+            "links_at_start": " ".join(f"{a}-{b}" for a, b in links),
+        }),
         "steps": run.steps,
         "step_s": run.step_s,
     }
@@ -38,8 +44,29 @@ def facts(p: Prepared) -> dict[str, Any]:
             found["input_room_mps2"] = [round(float(p.bounds.input_lower.max()), 6), round(float(p.bounds.input_upper.min()), 6)]
     else:
         found["sub_step_s"] = scene.sub_step
-    found["warnings"] = list(p.law.warnings(p.params, scene, p.start_track)) if hasattr(p.law, "warnings") else []
+    notes = [] if p.roster is None else list(p.roster.notes)
+    found["warnings"] = notes + list(p.law.warnings(p.params, scene, p.start_track)) if hasattr(p.law, "warnings") else notes
     found["report"] = list(p.law.report(p.params, scene, p.scenario.disturbance)) if hasattr(p.law, "report") else []
     if hasattr(p.law, "analysis"):
         found["analysis"] = p.law.analysis(p.params, scene, p.scenario.disturbance).as_dict()
     return found
+
+
+def _traffic(p: Prepared) -> dict[str, Any]:
+    """Facts of trains that come and go, and of their net."""
+    assert p.roster is not None
+    rails, roster, rules = p.roster.rails, p.roster, p.supervision
+    normal = ~rails.internal
+    together = [name for name, member in zip(p.scenario.ids, roster.cooperates, strict=True) if member]
+    return {
+        "net": f"{int(normal.sum())} rail edges, {float(rails.length_m[normal].sum()) / 1000:g} km",
+        "cooperate": "all" if len(together) == len(p.scenario.ids) else _some(together) or "none",
+        "departures": f"{float(roster.depart.min()):g} .. {float(roster.depart.max()):g} s",
+        "stops": sum(len(stops) for stops in roster.stops),
+        "supervisor": f"{rules.mode}, emergency braking {rules.emergency_mps2:g} m/s2",
+    }
+
+
+def _some(names: Sequence[str]) -> str:
+    more = len(names) - MOST
+    return ", ".join(names[:MOST]) + (f" and {more} more" if more > 0 else "")

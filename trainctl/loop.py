@@ -280,11 +280,12 @@ class Simulation:
         check = before is not None and self.service is None  # the service has asked before it coupled
         self.world.linked(links, self.formation)
         groups = graph.components(len(rank), links.sender, links.receiver)
+        here = self.world.measure().present
         self.journal.event(
             t,
             "topology",
             edges=graph.edges(links, p.scenario.ids),
-            formations=[[p.scenario.ids[i] for i in sorted(group)] for group in groups],
+            formations=[[p.scenario.ids[i] for i in sorted(group)] for group in groups if here[list(group)].any()],
             start_condition=p.law.violations(p.params, scene) if check else [],
         )
         for alarm in self.alarms.relinked(t, groups, self.formation, scene):

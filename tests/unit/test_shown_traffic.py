@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from trainctl.runner import run
 from trainctl.sumo import gui
 from trainctl.sumo.replay import replay
 
+MERGING = Path(__file__).resolve().parents[2] / "scenarios"
 SETTINGS = {"run.duration_s": 720}
 
 
@@ -139,6 +141,26 @@ def test_a_run_is_shown_again_as_sumo_had_it(merging, monkeypatch):
 def test_a_run_without_sumo_is_not_shown_again(numeric):
     with pytest.raises(Exception, match="made without SUMO, which alone knows where its net lies"):
         replay(numeric, "sumo")
+
+
+def test_what_is_said_before_and_after_a_run(tmp_path, monkeypatch, capsys):
+    found = json.loads(typed(monkeypatch, capsys, "check", "merging", "--json"))
+    assert found["net"] == "6 rail edges, 46.6707 km"
+    assert (found["cooperate"], found["stops"]) == ("all", 1)
+    assert "links_at_start" not in found and found["supervisor"].startswith("on, ")
+    (tmp_path / "merging").mkdir()
+    for path in MERGING.glob("merging/*"):
+        text = path.read_text().replace("</routes>", '<person id="p" depart="0"><walk edges="trunk"/></person></routes>')
+        (tmp_path / "merging" / path.name).write_text(text)
+    (tmp_path / "s.toml").write_text((MERGING / "merging.toml").read_text())
+    monkeypatch.chdir(tmp_path)
+    for command in (("check", "s.toml"), ("run", "s.toml", "--backend", "numeric", "--set", "run.duration_s=16")):
+        assert "warning: 1 definitions of persons left out" in typed(monkeypatch, capsys, *command)
+
+
+def test_formations_named_are_of_trains_that_are_there(numeric):
+    at_start = next(e for e in numeric.events if e["kind"] == "topology")
+    assert at_start["formations"] == [["fast.0"]]
 
 
 def test_any_rail_net_is_drawn(merging, tmp_path, monkeypatch, capsys):
