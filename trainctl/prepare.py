@@ -306,6 +306,9 @@ def prepare(scenario: Scenario, file: str, folder: Path, known: Sequence[str] = 
     ]  # fmt: skip
     if network is not None:
         prepared = replace(prepared, line=network[0], spec=network[1], net=network[2])
+        slopes = np.column_stack([network[0].gradient.breaks, network[0].gradient.slope])
+        if slopes[:, 1].any() and own.shape[1] > FORCE:  # actuators hold their trains where they start
+            prepared = replace(prepared, own=actuated_units.balanced(own, consists, slopes))
         if trains is not None:
             n = len(scenario.train)
             nobody = graph.links(plan, np.arange(n), np.arange(n))  # everybody alone

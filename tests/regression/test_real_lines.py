@@ -145,7 +145,7 @@ def test_st_gallen_wil_with_flirts_from_stand_to_stand(driven):
 def test_st_gallen_wil_with_units_and_couplers(driven):
     done, prepared, end = driven(ST_GALLEN_WIL, None, FINITE_TIME, duration=1500)
     check(done, prepared, end)
-    assert done.metrics["energy.traction_kwh_per_train_km"] == pytest.approx(4.32, abs=0.02)
+    assert done.metrics["energy.traction_kwh_per_train_km"] == pytest.approx(4.29, abs=0.02)
 
 
 def test_east_saxony_with_flirts(driven):

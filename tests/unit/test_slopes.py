@@ -43,3 +43,20 @@ def test_the_weight_of_a_train_is_made_up_for_and_lifted(law, tmp_path):
     if "gradient_j" in trains:
         assert trains.gradient_j.sum() == pytest.approx(200e3 * GRAVITY * 60.0, rel=2e-3)
     assert not [e for e in done.events if e["kind"] == "violation"]
+
+
+@pytest.mark.parametrize("name", ["emu_finite_time", "fault_tolerant"])
+def test_a_continuous_law_does_not_feel_a_slope(name, tmp_path):
+    """What a law demands comes on top of what holds the units on the slope; its observer sees the rest."""
+    runs = []
+    for k, gradient in enumerate(("[]", "[[0.0, 8.0]]")):
+        line = tmp_path / f"line{k}.toml"
+        line.write_text(f'name = "hill"\ntracks = [1]\nlength_m = 400000.0\nspeed = [[0.0, 100.0]]\ngradient = {gradient}\n')
+        settings = {"run.duration_s": 40, "network.line": str(line)}
+        runs.append(run(open_scenario(name, settings), tmp_path / str(k), "numeric"))
+    level, hill = (r.units for r in runs)
+    assert np.abs(hill.position_m - level.position_m).max() < 1e-6
+    assert np.abs(hill.speed_mps - level.speed_mps).max() < 1e-7
+    last = hill.time_s == 30.0
+    mass = open_scenario(name).consists.mass
+    np.testing.assert_allclose((hill.force_n - level.force_n)[last], mass * GRAVITY * 0.008, rtol=1e-3)

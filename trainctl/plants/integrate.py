@@ -33,7 +33,7 @@ bare: Any = partial(njit, cache=True, _nrt=False)
 class Parts(NamedTuple):
     """The closed loop's functions, compiled: see ``compiled``."""
 
-    functions: Any  # addresses of the seven functions, or these themselves where nothing is compiled
+    functions: Any  # addresses of the eight functions, or these themselves where nothing is compiled
     advance: Callable[..., None]
     exchange: Callable[..., None]
 
@@ -98,6 +98,7 @@ class Scratch(NamedTuple):
     power: Floats  # (n, 6)
     sent: Floats  # (n, w)
     limited: Floats  # (n,)
+    weight: Floats  # (U,) N, along the track
     own: Floats  # (U, s) at the beginning of the step
     own_sum: Floats  # (U, s) weighted sum of the stages' rates
     estimate: Floats  # (U, q)
@@ -110,8 +111,8 @@ def scratch(own: Floats, estimate: Floats, trains: int, corrections: int, messag
     units = len(own)
     return Scratch(
         np.zeros(4), np.zeros((units, corrections)), np.zeros(units), np.zeros_like(own), np.zeros_like(estimate),
-        np.zeros((trains, len(POWERS))), np.zeros((trains, message)), np.zeros(trains), np.zeros_like(own), np.zeros_like(own),
-        np.zeros_like(estimate), np.zeros_like(estimate), np.zeros(units),
+        np.zeros((trains, len(POWERS))), np.zeros((trains, message)), np.zeros(trains), np.zeros(units), np.zeros_like(own),
+        np.zeros_like(own), np.zeros_like(estimate), np.zeros_like(estimate), np.zeros(units),
     )  # fmt: skip
 
 
@@ -129,8 +130,12 @@ def lead(i, loop, t, work):  # type: ignore[no-untyped-def]
 
 @bare()
 def stage(parts, loop, first, links, reference, air, t, inside, own, estimate, work):  # type: ignore[no-untyped-def]
-    """Evaluate the closed loop at one instant: fills ``work`` with forces and rates."""
-    demand, message, _, correction, estimate_rate, limit, rate = parts
+    """Evaluate the closed loop at one instant: fills ``work`` with forces and rates.
+
+    The weight along the track is known and made up for: it is added to what the law demands, within the limits. Observers, which
+    know of no slopes, see the rest.
+    """
+    demand, message, _, correction, estimate_rate, limit, rate, weight = parts
     observed = estimate.shape[1] > 0
     leader_at(reference, t, inside, work.leader)
     age = 0.0 if air.live else t - air.sent_at
@@ -154,14 +159,24 @@ def stage(parts, loop, first, links, reference, air, t, inside, own, estimate, w
             i, loop.law, work.leader, age, links.slot[i], own[a:b], estimate[a:b], work.correction[a:b],
             links.desired[e:f], air.heard[e:f], work.applied[a:b],
         )  # fmt: skip
+        climbs = weight(i, loop.plant, own[a:b], work.weight[a:b])
         if len(force) > 0 and force[a] == force[a]:  # not NaN
             for u in range(a, b):
                 work.applied[u] = force[u]
+        elif climbs:
+            for u in range(a, b):
+                work.applied[u] += work.weight[u]
         work.limited[i] = 1.0 if limit(i, loop.plant, own[a:b], work.applied[a:b]) else 0.0
         if observed:
+            if climbs:
+                for u in range(a, b):
+                    work.applied[u] -= work.weight[u]
             estimate_rate(
                 i, loop.observer, own[a:b], estimate[a:b], work.correction[a:b], work.applied[a:b], work.estimate_rate[a:b]
             )  # fmt: skip
+            if climbs:
+                for u in range(a, b):
+                    work.applied[u] += work.weight[u]
         if air.live and air.chain:
             message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
         rate(i, loop.plant, t, inside, own[a:b], work.applied[a:b], work.own_rate[a:b], work.power[i])
@@ -261,7 +276,7 @@ def advance_kernel(functions, loop, first, length, links, reference, air, t, h, 
 
 
 def signatures(loop: Any, first: Any, links: Any) -> tuple[Any, ...]:
-    """Types of the seven functions for these types of ``Loop``, ``first`` and ``Links``, in the order of ``Parts.functions``."""
+    """Types of the eight functions for these types of ``Loop``, ``first`` and ``Links``, in the order of ``Parts.functions``."""
     whole, real, row, table = types.int64, types.float64, types.float64[::1], types.float64[:, ::1]
     law, observer, plant, _ = loop
     return (
@@ -272,6 +287,7 @@ def signatures(loop: Any, first: Any, links: Any) -> tuple[Any, ...]:
         types.void(whole, observer, table, table, table, row, table),
         types.boolean(whole, plant, table, row),
         types.void(whole, plant, real, real, table, row, table, row),
+        types.boolean(whole, plant, table, row),
     )
 
 
@@ -299,7 +315,7 @@ def from_addresses(typingctx, functions, loop, first, links):  # type: ignore[no
 
 
 def closed_loop(functions: Any, loop: Any, first: Any, links: Any) -> Any:
-    """Make the seven functions of ``Parts.functions`` ready to be called."""
+    """Make the eight functions of ``Parts.functions`` ready to be called."""
     return functions
 
 
@@ -315,7 +331,8 @@ def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...]) ->
     They serve as long as the types of the arguments stay: new values, links and constants of the same shape of data need no
     new call. Compiled code is cached on disk between processes, each module's own.
     """
-    functions = (law.demand, law.message, law.watch, observer.correction, observer.rate, plant.limit, plant.rate)
+    weight = getattr(law, "weight", plant.weight)  # a law that makes up for slopes itself says so with a function of its own
+    functions = (law.demand, law.message, law.watch, observer.correction, observer.rate, plant.limit, plant.rate, weight)
     if config.DISABLE_JIT:
         return Parts(functions, advance_kernel, exchange_kernel)
     loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes = (typeof(a) for a in arguments)
