@@ -178,7 +178,7 @@ def violations(params: Params, scene: Scene) -> list[str]:
 
 
 def train_of(consists: Consists) -> Train:
-    """What the observer knows of the trains. A slope is not among it: the loop makes up for the weight, see ``plants.integrate``."""
+    """What the observer knows of the trains. Slopes are not among it: ``plants.integrate`` makes up for the weight."""
     mass = consists.mass * consists.rotating
     before = np.concatenate([[0.0], consists.damping[:-1]])
     before[consists.first[:-1]] = 0.0
