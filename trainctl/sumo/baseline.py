@@ -264,6 +264,8 @@ class Session:
     def _row(self, i: int, edge: int) -> int:
         """The row of the edge a train is on, from where it was on its way."""
         row, end = int(self.at[i]), int(self.ways.first[i + 1])
+        if self.ways.edge[row] == edge:
+            return row
         onward = np.flatnonzero(self.ways.edge[row:end] == edge)
         if not len(onward):
             raise CouplingError(f"train {self.p.scenario.ids[i]} left its way on edge {self.line.edges[edge]} at {self.time:.3f} s")
