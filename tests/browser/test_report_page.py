@@ -134,3 +134,32 @@ def test_a_million_rows_are_drawn_and_moved_quickly(tmp_path):
         """)
         assert took[len(took) // 2] < 50.0  # ms; the median, as others may use the machine
         assert browser.complaints() == []
+
+
+def test_trains_that_come_and_go_are_drawn_on_their_net(finished, browser):
+    done = finished("merging")
+    browser.open(report(done))
+    browser.until(READY)
+    stopped = next(e["time_s"] for e in done.events if e["kind"] == "stop_reached")
+    pictures = []
+    for time in (0.0, stopped):
+        told = moved_to(browser, time)
+        pictures.append(browser.run("return document.getElementById('view').toDataURL()"))
+        assert told[0] == f"{time:g} s"
+    assert pictures[0] != pictures[1]
+    assert "stopping: trunk, 0.00 m/s" in told[2]
+    assert browser.complaints() == []
+
+
+def test_a_page_without_animation_is_alive(browser, tmp_path):
+    from trainctl.prepare import open_scenario
+    from trainctl.runner import run
+
+    done = run(open_scenario("merging", {"run.duration_s": 96}), tmp_path / "r", "numeric")
+    browser.open(report(done))
+    browser.until(READY)
+    assert browser.run("return document.getElementById('view').offsetParent") is None
+    browser.run("document.querySelector('button.link').click()")
+    browser.press(" ")
+    assert browser.run("return document.querySelectorAll('.plot').length") >= 4
+    assert browser.complaints() == []

@@ -68,9 +68,14 @@ def _of_traffic(drawn: Drawn) -> dict[str, Any]:
     where = on_the_map(drawn, times)
     if where is None:
         where, times = {"tracks": []}, times[:0]
+    split = drawn.trains
+    at, v, speed = split.column("time_s"), split.column("speed_mps"), np.full((len(times), len(split.names)), np.nan)
+    for k, (_, rows) in enumerate(split.slices() if len(times) else ()):
+        frame, row = _matched(times, at[rows])
+        speed[frame, k] = v[rows][row]
     pairs, links = _links(drawn, times) if len(times) else ([], np.zeros((0, 0), np.uint8))
     return {
-        "crossovers": [], "trains": _trains(drawn), "time": [round(float(t), 6) for t in times],
+        "crossovers": [], "trains": _trains(drawn), "time": [round(float(t), 6) for t in times], "speed": packed(speed),
         "pairs": pairs, "links": base64.b64encode(links.tobytes()).decode(), **where, **_events(drawn),
     }  # fmt: skip
 

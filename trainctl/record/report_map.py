@@ -19,8 +19,7 @@ from trainctl.signals import Floats
 
 #: What is read of SUMO's FCD log.
 COLUMNS = {
-    "timestep_time": "time_s", "vehicle_id": "train", "vehicle_x": "x", "vehicle_y": "y", "vehicle_speed": "speed",
-    "vehicle_lane": "lane",
+    "timestep_time": "time_s", "vehicle_id": "train", "vehicle_x": "x", "vehicle_y": "y", "vehicle_lane": "lane",
 }  # fmt: skip
 
 
@@ -38,8 +37,8 @@ def on_the_map(drawn: Drawn, times: Floats) -> dict[str, Any] | None:
     -------
     dict or None
         ``map`` (x and y [m] of every track, one after the other, a NaN in between), ``tracks`` (edges that trains were on),
-        ``position`` and ``lateral`` (x and y of fronts [m], frames x trains), ``speed``, ``edge`` (numbers of ``tracks``). None if
-        the run was made without SUMO, which alone knows where its net lies.
+        ``position`` and ``lateral`` (x and y of fronts [m], frames x trains), ``edge`` (numbers of ``tracks``). None if the run
+        was made without SUMO, which alone knows where its net lies.
     """
     folder = drawn.run.folder / "sumo"
     nets, log = sorted(folder.glob("*.net.xml")), folder / "fcd.parquet"
@@ -60,7 +59,7 @@ def on_the_map(drawn: Drawn, times: Floats) -> dict[str, Any] | None:
     train = seen["train"].map(number).to_numpy()
     edges = seen["lane"].astype(str).str.rpartition("_")[0].astype("category")
     grids = []
-    for values in (seen["x"], seen["y"], seen["speed"], edges.cat.codes):
+    for values in (seen["x"], seen["y"], edges.cat.codes):
         grid = np.full((len(times), len(number)), np.nan)
         grid[frame, train] = values.to_numpy(dtype=float)
         grids.append(packed(grid))
@@ -68,5 +67,5 @@ def on_the_map(drawn: Drawn, times: Floats) -> dict[str, Any] | None:
     points = np.concatenate([part for piece in pieces for part in (piece.points, gap)])
     return {
         "map": [packed(points[:, 0]), packed(points[:, 1])], "tracks": [str(e) for e in edges.cat.categories],
-        "position": grids[0], "lateral": grids[1], "speed": grids[2], "edge": grids[3],
+        "position": grids[0], "lateral": grids[1], "edge": grids[2],
     }  # fmt: skip
