@@ -65,24 +65,40 @@ class Prepared:
     def supervision(self) -> supervisor.Params:
         """How trains are protected: as the scenario says, else only where they come and go.
 
-        Where the scenario states no emergency braking it is the supervisor's usual one, or less if a train cannot give that.
+        Where the scenario states no emergency braking, and no greatest acceleration, they are the supervisor's usual ones, or more
+        if the bounds of the inputs allow the law more: it must not act on what the law may do. No braking is relied on that some
+        train cannot give.
         """
         stated = self.scenario.supervisor or supervisor.Params()
         known: dict[str, Any] = {}
         if "mode" not in stated.model_fields_set and self.roster is not None:
             known["mode"] = "on"
+        if "greatest_mps2" not in stated.model_fields_set:
+            pulls = self.bounds.input_upper
+            known["greatest_mps2"] = float(max([stated.greatest_mps2, *pulls[np.isfinite(pulls)]]))
         if "emergency_mps2" not in stated.model_fields_set:
-            known["emergency_mps2"] = math.floor(1000.0 * min(stated.emergency_mps2, self.sure_braking.min())) / 1000.0
+            v = self.fastest
+            resistance = np.sum(self.consists.train_davis() * np.column_stack([np.ones_like(v), v, v**2]), axis=1)
+            brakes = resistance - self.bounds.input_lower
+            wanted = math.ceil(1000.0 * max([stated.emergency_mps2, *brakes[np.isfinite(brakes)]])) / 1000.0
+            known["emergency_mps2"] = min(wanted, float(np.floor(1000.0 * self.sure_braking.min())) / 1000.0)
             known["service_mps2"] = min(stated.service_mps2, known["emergency_mps2"])
         return stated.model_copy(update=known)
 
+    @property
+    def fastest(self) -> Floats:
+        """Speed up to which every train is looked at [m/s], shape (n,)."""
+        upper = self.bounds.speed_upper
+        found: Floats = np.where(np.isfinite(upper), upper, max(self.leader(0.0)[1], 1.0))
+        return found
+
     @cached_property
     def sure_braking(self) -> Floats:
-        """Deceleration every train can give at any speed it may have [m/s2], shape (n,); infinite for points."""
+        """Deceleration every train can give at any speed it may have [m/s2], shape (n,); infinite for points without a clamp."""
         if self.scenario.plant.kind == "point":
-            return np.full(len(self.scenario.train), np.inf)
-        fastest = np.where(np.isfinite(self.bounds.speed_upper), self.bounds.speed_upper, max(self.leader(0.0)[1], 1.0))
-        least, _ = shared.room(self.consists, np.zeros_like(fastest), fastest)
+            clamp = self.plant_params.input_lower_mps2
+            return np.full(len(self.scenario.train), np.inf if clamp is None else -clamp)
+        least, _ = shared.room(self.consists, np.zeros_like(self.fastest), self.fastest)
         return -least
 
     @property
