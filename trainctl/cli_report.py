@@ -55,11 +55,11 @@ def compare(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")] = False,
     trains: Annotated[int | None, typer.Option(help="Trains; default 40.", rich_help_panel=CAPACITY)] = None,
-    length_km: Annotated[float | None, typer.Option(help="Measured stretch [km]; default 100.", rich_help_panel=CAPACITY)] = None,
-    speed_mps: Annotated[float | None, typer.Option(help="Line speed [m/s]; default 83.333.", rich_help_panel=CAPACITY)] = None,
-    signals_m: Annotated[float | None, typer.Option(help="Blocks [m]; default 2000.", rich_help_panel=CAPACITY)] = None,
+    length_km: Annotated[float | None, typer.Option(help="Measured stretch in km; default 100.", rich_help_panel=CAPACITY)] = None,
+    speed_mps: Annotated[float | None, typer.Option(help="Line speed in m/s; default 83.333.", rich_help_panel=CAPACITY)] = None,
+    signals_m: Annotated[float | None, typer.Option(help="Blocks in m; default 2000.", rich_help_panel=CAPACITY)] = None,
     spacing_m: Annotated[
-        float | None, typer.Option(help="Desired spacing of the formations [m]; default 3000.", rich_help_panel=CAPACITY)
+        float | None, typer.Option(help="Desired spacing of the formations in m; default 3000.", rich_help_panel=CAPACITY)
     ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Runs at a time; default one per core.", rich_help_panel=CAPACITY)
@@ -83,6 +83,8 @@ def compare(
         "signals_m": signals_m, "spacing_m": spacing_m,
     }  # fmt: skip
     if names == ["capacity"] and controllers is None:
+        if settings or backend != "sumo":
+            raise InputError("capacity: takes no --set and no --backend; its scenarios lie in --out afterwards")
         chosen = {key: value for key, value in plan.items() if value is not None}
         _capacity(chosen, out or Path("runs/capacity"), wanted, workers, as_json)
         return

@@ -144,6 +144,8 @@ def test_a_folder_named_capacity_and_options_of_capacity(tmp_path: Path, monkeyp
     for typed, line in (
         (["./capacity"], "capacity: not a run folder: it has no run.json"),
         (["./capacity", "--trains", "3"], "--trains: only with `trainctl compare capacity`"),
+        (["capacity", "--set", "run.step_s=0.5"], "capacity: takes no --set"),
+        (["capacity", "--backend", "numeric"], "capacity: takes no --set and no --backend"),
     ):
         with pytest.raises(InputError, match=line):
             CliRunner().invoke(app, ["compare", *typed], catch_exceptions=False, standalone_mode=False)
