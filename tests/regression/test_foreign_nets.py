@@ -10,7 +10,9 @@ import nets
 import numpy as np
 import pytest
 import tomli_w
+from sumo import SUMO_HOME
 
+from trainctl.errors import InputError
 from trainctl.prepare import open_scenario
 from trainctl.record.run import Run
 from trainctl.runner import run
@@ -169,3 +171,29 @@ def test_fifty_trains_of_two_lengths_couple_and_arrive(tmp_path):
     found = go(tmp_path, tables)
     unharmed(found)
     assert kinds(found)["couple"] >= 45
+
+
+def of_the_game(duration: float, **types: Any) -> dict[str, Any]:
+    """The rail example that ships with SUMO: stations, single track, trains of two types."""
+    tables = nets.scenario(
+        "robust_constrained", duration, types=("freightTrain", "passengerTrain"), run={"step_s": 0.2, "record_every_s": 1.0},
+        network={"sumocfg": str(Path(SUMO_HOME) / "tools" / "game" / "rail.sumocfg")}, reference={"speed_mps": 20.0},
+        topology={"spacing_m": 300.0, "lower_m": 120.0, "upper_m": 500.0}, traffic={"join_band_m": 10.0},
+    )  # fmt: skip
+    return tables | {"train_type": {k: v | {"unit_length_m": types[k]} for k, v in tables["train_type"].items() if k in types}}
+
+
+def test_rail_example_of_sumo(tmp_path):
+    found = go(tmp_path, of_the_game(230.0, freightTrain=72.0, passengerTrain=52.0))
+    count = kinds(found)
+    assert count["arrive"] == count["stop_reached"] == count["stop_left"] == 3
+    assert count["violation"] == count["supervisor"] == 0
+    assert "<collision " not in (found.folder / "sumo" / "collisions.xml").read_text()
+    said = [e["message"] for e in found.events if e["kind"] == "sumo_warning"]
+    assert all("Missing yellow phase" in message for message in said)  # its own signals', whoever drives
+
+
+def test_rail_example_of_sumo_without_data_of_its_trains(tmp_path):
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(of_the_game(230.0, freightTrain=72.0)))
+    with pytest.raises(InputError, match=r"vType passengerTrain: no mass, .*: add \[train_type.passengerTrain\]"):
+        open_scenario(str(tmp_path / "s.toml"))

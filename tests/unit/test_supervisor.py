@@ -119,7 +119,7 @@ def test_applied_keeps_the_verdict_and_says_where_it_changed_the_motion():
 def test_point_trains_move_as_the_verdict_takes_them_to():
     """Driven at the verdict by their own plant, they come to stand at the margin and not beyond it."""
     davis = np.tile([0.01, 1e-4, 1e-5], (3, 1))
-    constants = point.Constants(davis, *(np.full(3, c) for c in (1.0, -np.inf, np.inf, 0.0, np.inf)), np.zeros((0, 2)))
+    constants = point.Constants(davis, *(np.full(3, c) for c in (1.0, -np.inf, np.inf, 0.0, np.inf)), np.zeros((0, 2)), np.zeros(3))
     own = np.array([[0.0, 40.0], [0.0, 13.3], [0.0, 0.0]])
     for _ in range(700):
         ahead = [target(2000.0 - x, kind=END, train=i) for i, x in enumerate(own[:, 0])]
