@@ -91,7 +91,7 @@ CASES = {
         ["event[1]: crossover leave: its switch at 99945 m lies behind", "train 2 is at 1007"],
     ),
     "missing net": (PAPER + '[network]\nline = 1\n', ["network.line = 1: input should be a valid string"]),
-    "no such line": (PAPER + '[network]\nline = "four"\n', ["network.line = four: no such line; known: single_track, three_tracks"]),
+    "no such line": (PAPER + '[network]\nline = "four"\n', ["network.line = four: no such line; known: fast_crossovers, single_track, three_tracks"]),
     "no such law": (PAPER + '[controller]\nlaw = "magic"\n', ["controller.law = magic: no such law; known:"]),
     "loss without seed": (PAPER + "[topology]\nloss = 0.1\n", ["topology.loss = 0.1: losses are random, so the run needs [run] seed"]),
     "units of the wrong number": (

@@ -138,8 +138,8 @@ def test_what_such_runs_cannot_do_is_said_at_once(typed, tmp_path):
     short = ("--backend", "numeric", "--set", "run.duration_s=16", "--out", "r")
     code, lines = typed("run", "mistaken.toml", *short, "--checkpoint-every", "8")
     assert (code, lines) == (2, ["--checkpoint-every: a run with network.sumocfg cannot be resumed yet; leave it out"])
-    code, lines = typed("run", "mistaken.toml", "--set", "controller.law=sumo")
-    assert code == 2 and "not with network.sumocfg yet" in lines[0]
+    code, lines = typed("run", "mistaken.toml", "--set", "controller.law=sumo", "--out", "r")
+    assert code == 2 and "merging.net.xml has no rail signals" in lines[0]
     assert not (tmp_path / "r").exists() and not (tmp_path / "r.partial").exists()
 
 
