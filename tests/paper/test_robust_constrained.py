@@ -27,6 +27,7 @@ from trainctl.claims.robust_constrained import (
     Loop,
     N,
     T,
+    along_the_example,
     both,
     entries,
     gain_of,
@@ -39,7 +40,7 @@ from trainctl.claims.robust_constrained import (
     theorem,
 )
 from trainctl.controllers import robust_constrained as law
-from trainctl.controllers import robust_gain, robust_theory
+from trainctl.controllers import robust_gain
 from trainctl.plants import disturbance, point
 from trainctl.signals import POSITION, SPEED, Floats, Trains
 
@@ -301,26 +302,7 @@ def test_assumption_2_needs_weights_of_millionths() -> None:
 
 def test_system_matrix_is_not_stochastic_yet_the_spread_falls() -> None:
     """(16) along the undisturbed example with c = 2/h: negative elements for 55 steps, so Lemma 2 does not explain why it works."""
-    loop = Loop(scene([LINE], START, np.zeros(N)))
-    big, c = robust_gain.laplacian(N, loop.scene.links), 2 / 0.3
-    negative, least, spreads, rho2_least = 0, 0.0, [], 1.0
-    for _ in range(400):
-        p = loop.own[:, POSITION] - loop.scene.links.slot - V0 * loop.k * T
-        v = loop.own[:, SPEED] - V0
-        spreads.append(robust_theory.start_spread(p, v, np.full(N, c)))
-        r = point.resistance(loop.own[:, SPEED], loop.plant.davis)
-        f2 = -H * v - big @ p
-        cut = np.clip(f2, -2.0 - r, 2.0 - r)
-        f1 = v + cut * T
-        rho2 = np.divide(cut, f2, out=np.ones(N), where=f2 != 0.0)
-        rho1 = np.divide(np.clip(f1, -V0, 5.0), f1, out=np.ones(N), where=f1 != 0.0)
-        own = rho1 * (1 - rho2 * H * T)
-        lower_left = np.diag(1 - T / c - own) - c * T * np.diag(rho1 * rho2) @ big
-        smallest = min(lower_left.min(), (T / c + own).min())
-        negative += int(smallest < -1e-12)
-        least, rho2_least = min(least, smallest), min(rho2_least, float(rho2.min()))
-        loop.step()
-        np.testing.assert_allclose(loop.own[:, SPEED] - V0, rho1 * (v + rho2 * f2 * T), atol=1e-9)  # (12)
+    negative, least, rho2_least, spreads = along_the_example()  # which asserts (12) in every step
     assert negative == 55
     assert least == pytest.approx(-0.116, abs=1e-3)
     assert rho2_least == pytest.approx(0.034, abs=1e-3)
