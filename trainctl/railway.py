@@ -243,6 +243,10 @@ class Service:
         rules, v = self.rules, self.roster.speed[i]
         on_edge = float(self.p.rails.speed_mps[self.roster.edge[i]]) - self.driving.below_limit_mps
         wanted = float(min(self.cruise[i], max(on_edge, 0.0)) if np.isnan(v) else v)
+        if (stop := self.stop_of(i)) is not None:  # it must be able to stop there
+            ahead = stop.place - float(self.p.rails.start_m[self.roster.edge[i]]) - float(self.roster.lane_position[i])
+            room = np.array([ahead - wanted * self.step])
+            wanted = min(wanted, float(supervisor.greatest_speed(room, rules.service_mps2, self.step, self.theta)[0]))
         here = view.targets.train == i
         room = view.targets.room[here] - rules.margin_m
         follows = view.targets.moving[here] & (view.targets.kind[here] == supervisor.TRAIN) & (rules.curve == "relative")

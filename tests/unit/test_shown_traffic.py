@@ -178,3 +178,15 @@ def test_tables_of_such_runs_name_trains_only_while_they_are_there(numeric):
     again = Run(numeric.folder)
     assert again.trains["in_formation"].isin((0.0, 1.0)).all()
     assert set(again.trains["train"].astype(str)) < {t["id"] for t in again.scenario["train"]}
+
+
+@pytest.mark.parametrize("place", [120, 400, 1200])
+def test_a_station_near_the_entry_is_not_overrun(tmp_path, place):
+    (tmp_path / "merging").mkdir()
+    for path in MERGING.glob("merging/*"):
+        text = path.read_text().replace('edge="trunk" endPos="8900"', f'edge="from_west" endPos="{place}"')
+        (tmp_path / "merging" / path.name).write_text(text.replace('depart="165"', 'depart="2"'))
+    (tmp_path / "s.toml").write_text((MERGING / "merging.toml").read_text())
+    done = run(open_scenario(str(tmp_path / "s.toml"), {"run.duration_s": 160}), tmp_path / "r", "numeric")
+    (stop,) = [e for e in done.events if e["kind"] == "stop_reached"]
+    assert (stop["train"], abs(stop["short_m"]) < 2.0) == ("stopping", True)
