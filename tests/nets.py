@@ -6,6 +6,7 @@ A net goes into ``folder`` as ``a.net.xml`` with ``a.rou.xml`` and ``a.sumocfg``
 from __future__ import annotations
 
 import copy
+import random
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
@@ -244,3 +245,32 @@ def separate(folder: Path) -> None:
         {"ab": ("a", "b"), "dc": ("d", "c"), "ef": ("e", "f")},
     )
     traffic(folder, flow("p", "ab", 4, 40) + flow("q", "dc", 4, 40))
+
+
+def at_random(folder: Path, seed: int) -> None:
+    """A main line with branches that join and part, limits, stops and flows, all drawn."""
+    draw = random.Random(seed)
+    joins = draw.randint(2, 5)
+    nodes, edges, body = {"j0": (0, 0)}, {}, ""
+    for k in range(1, joins + 1):
+        nodes[f"j{k}"] = (nodes[f"j{k - 1}"][0] + draw.randint(4000, 9000), draw.randint(-500, 500))
+        edges[f"m{k}"] = (f"j{k - 1}", f"j{k}", {"speed": draw.choice([25, 33, 40, 40, 45])})
+    nodes["z"] = (nodes[f"j{joins}"][0] + 8000, 0)
+    edges["mz"] = (f"j{joins}", "z")
+    for k in range(joins + 1):
+        x, y = nodes[f"j{k}"]
+        for name, chance, away in (("in", 0.8 if k else 1.0, -7000), ("out", 0.5 if k else 0.0, 7000)):
+            if draw.random() < chance:
+                nodes[f"{name}{k}"] = (x + away + draw.randint(0, 1000), y + draw.choice([-1, 1]) * draw.randint(800, 3000))
+                edges[f"{name}{k}"] = (f"in{k}", f"j{k}") if name == "in" else (f"j{k}", f"out{k}")
+    for k in [k for k in range(joins + 1) if f"in{k}" in edges]:
+        for number in range(draw.randint(1, 2)):
+            end = draw.choice([*(e for e in range(k + 1, joins + 1) if f"out{e}" in edges), None])
+            middle = [f"m{e}" for e in range(k + 1, (joins if end is None else end) + 1)]
+            way = [f"in{k}", *middle, "mz" if end is None else f"out{end}"]
+            if draw.random() < 0.4:
+                stop = f'<stop lane="{way[1]}_0" endPos="{draw.randint(500, 3000)}" duration="{draw.randint(5, 90)}"/>'
+                body += train(f"stops{k}.{number}", " ".join(way), draw.randint(0, 400), stop)
+            body += flow(f"f{k}.{number}", " ".join(way), draw.randint(2, 5), draw.randint(25, 200), draw.randint(0, 300))
+    net(folder, nodes, edges, *draw.choice([(), ("--no-internal-links",)]))
+    traffic(folder, body)

@@ -197,3 +197,16 @@ def test_rail_example_of_sumo_without_data_of_its_trains(tmp_path):
     (tmp_path / "s.toml").write_text(tomli_w.dumps(of_the_game(230.0, freightTrain=72.0)))
     with pytest.raises(InputError, match=r"vType passengerTrain: no mass, .*: add \[train_type.passengerTrain\]"):
         open_scenario(str(tmp_path / "s.toml"))
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("law", nets.LAWS)
+@pytest.mark.parametrize("seed", range(20))
+def test_nets_drawn_at_random(tmp_path, law, seed):
+    """The law alone cannot always brake a formation as planned for: there the supervisor may act, short of an emergency."""
+    nets.at_random(tmp_path, seed)
+    found = go(tmp_path, nets.scenario(law, 3600))
+    assert "<collision " not in (found.folder / "sumo" / "collisions.xml").read_text()
+    assert [e for e in found.events if e["kind"] in ("sumo_warning", "violation")] == []
+    assert [e for e in found.events if e["kind"] == "supervisor" and e["emergency"]] == []
+    assert len([e for e in found.events if e["kind"] == "arrive"]) == len(found.trains.train.unique())
