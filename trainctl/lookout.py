@@ -139,8 +139,14 @@ def judge(
     waits = verdict(params, speed, clear, limits, step, theta)
     other = waits.greatest > follows.greatest
     waits = waits._replace(target=waits.target + np.where((waits.reason >= 0) & (waits.reason != LIMIT), len(targets.train), 0))
-    fields = zip(waits[:5], follows[:5], strict=True)
-    return Verdict(*(np.where(other, a, b) for a, b in fields), follows.strongest)
+    return Verdict(
+        greatest=np.where(other, waits.greatest, follows.greatest),
+        least=follows.least,
+        emergency=np.where(other, waits.emergency, follows.emergency),
+        reason=np.where(other, waits.reason, follows.reason),
+        target=np.where(other, waits.target, follows.target),
+        strongest=follows.strongest,
+    )
 
 
 def of(targets: Targets, kept: Bools) -> Targets:

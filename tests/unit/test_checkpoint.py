@@ -104,6 +104,7 @@ def test_a_file_is_replaced_whole(tmp_path):
 def test_every_array_of_the_loop_is_in_a_checkpoint(tmp_path):
     """Whoever adds an array to the loop or to the motion of units has to say whether it changes."""
     fixed = {"p", "line_track", "gradient", "breaks", "masses", "plant", "signals", "parts"}
+    fixed |= {"orders"}  # written anew in every step before they are read
     prepared = open_scenario("fault_tolerant_noise", {"run.duration_s": 3})
     with opened(prepared, tmp_path / "run", "numeric") as simulation:
         simulation.step()

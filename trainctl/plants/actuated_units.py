@@ -30,6 +30,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
+from trainctl.kernels import bare
 from trainctl.plants import coupled_units
 from trainctl.plants.coupled_units import (
     BRAKING,
@@ -53,7 +54,6 @@ from trainctl.plants.coupled_units import (
 )
 from trainctl.plants.faults import Fault, Faults, effectiveness, fault_rate, tabulated
 from trainctl.plants.faults import violations as fault_violations
-from trainctl.plants.integrate import bare
 from trainctl.signals import FORCE, GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Scene, Table
 
 STATES = 3

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from trainctl.plants.integrate import bare
+from trainctl.kernels import bare
 from trainctl.signals import GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Table
 
 STATES = 2

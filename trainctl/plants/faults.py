@@ -14,7 +14,7 @@ from typing import Annotated, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from trainctl.plants.integrate import bare
+from trainctl.kernels import bare
 from trainctl.signals import Consists, Floats, Ints, Table
 
 #: Keys each kind needs besides its place and window.

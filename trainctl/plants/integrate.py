@@ -10,15 +10,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-from numba import njit
 from numba.core import cgutils as untyped_cgutils
 from numba.extending import intrinsic, overload
 
+from trainctl.kernels import bare
 from trainctl.signals import FORCE, POWERS, Floats, Ints, Links, Reference, leader_at
 
 types: Any = numba.types
@@ -26,8 +25,8 @@ typeof: Any = numba.typeof
 cgutils: Any = untyped_cgutils
 config: Any = numba.config
 
-#: ``njit`` without numba's run time, its allocation and reference counts.
-bare: Any = partial(njit, cache=True, _nrt=False)
+#: Trains integrated together where they do not hear each other: few enough for the second cache, enough to share the calls.
+TOGETHER = 64
 
 
 class Parts(NamedTuple):
@@ -129,8 +128,8 @@ def lead(i, loop, t, work):  # type: ignore[no-untyped-def]
 
 
 @bare()
-def stage(parts, loop, first, links, reference, air, t, inside, own, estimate, work):  # type: ignore[no-untyped-def]
-    """Evaluate the closed loop at one instant: fills ``work`` with forces and rates.
+def stage(parts, loop, first, links, reference, air, t, inside, own, estimate, work, low, high):  # type: ignore[no-untyped-def]
+    """Evaluate the closed loop of trains ``low`` to ``high`` at one instant: fills ``work`` with forces and rates.
 
     The weight along the track is known and made up for: it is added to what the law demands, within the limits. Observers, which
     know of no slopes, see the rest.
@@ -139,18 +138,20 @@ def stage(parts, loop, first, links, reference, air, t, inside, own, estimate, w
     observed = estimate.shape[1] > 0
     leader_at(reference, t, inside, work.leader)
     age = 0.0 if air.live else t - air.sent_at
-    force = loop.orders.force
-    for i in range(len(first) - 1):
+    force, talk = loop.orders.force, talking(air)
+    hilly = len(loop.plant.gradient) > 0 or len(loop.orders.pace) > 0  # trains that come and go have their slopes by the unit
+    for i in range(low, high):
         a, b = first[i], first[i + 1]
         if observed:
             correction(i, loop.observer, own[a:b], estimate[a:b], work.correction[a:b])
-        if air.live and not air.chain:
+        if talk and not air.chain:
             lead(i, loop, t, work)
             message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
-    for i in links.order:
+    for p in range(low, high):
+        i = links.order[p] if talk else p
         a, b = first[i], first[i + 1]
         e, f = links.first[i], links.first[i + 1]
-        if air.live:
+        if talk:
             for k in range(e, f):
                 for q in range(air.heard.shape[1]):
                     air.heard[k, q] = work.sent[links.sender[k], q]
@@ -159,7 +160,7 @@ def stage(parts, loop, first, links, reference, air, t, inside, own, estimate, w
             i, loop.law, work.leader, age, links.slot[i], own[a:b], estimate[a:b], work.correction[a:b],
             links.desired[e:f], air.heard[e:f], work.applied[a:b],
         )  # fmt: skip
-        climbs = weight(i, loop.plant, own[a:b], work.weight[a:b])
+        climbs = hilly and weight(i, loop.plant, own[a:b], work.weight[a:b])
         if len(force) > 0 and force[a] == force[a]:  # not NaN
             for u in range(a, b):
                 work.applied[u] = force[u]
@@ -177,7 +178,7 @@ def stage(parts, loop, first, links, reference, air, t, inside, own, estimate, w
             if climbs:
                 for u in range(a, b):
                     work.applied[u] += work.weight[u]
-        if air.live and air.chain:
+        if talk and air.chain:
             message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
         rate(i, loop.plant, t, inside, own[a:b], work.applied[a:b], work.own_rate[a:b], work.power[i])
 
@@ -187,7 +188,7 @@ def exchange_kernel(functions, loop, first, links, reference, air, t, own, estim
     """See ``exchange``."""
     parts = closed_loop(functions, loop, first, links)
     message = parts[1]
-    stage(parts, loop, first, links, reference, air, t, t, own, estimate, work)
+    stage(parts, loop, first, links, reference, air, t, t, own, estimate, work, 0, len(first) - 1)
     for i in range(len(first) - 1):
         a, b = first[i], first[i + 1]
         lead(i, loop, t, work)
@@ -195,20 +196,21 @@ def exchange_kernel(functions, loop, first, links, reference, air, t, own, estim
 
 
 @bare()
-def see(parts, loop, first, length, links, t, own, work, extremes):  # type: ignore[no-untyped-def]
-    """Widen ``extremes`` by the state and the forces of this instant; what is NaN widens nothing."""
+def see(parts, loop, first, length, links, t, own, work, extremes, low, high):  # type: ignore[no-untyped-def]
+    """Widen ``extremes`` of trains ``low`` to ``high`` by the state and the forces of this instant; what is NaN widens nothing."""
     watch = parts[2]
-    for i in range(len(first) - 1):
+    for i in range(low, high):
         a, b = first[i], first[i + 1]
         for u in range(a, b):
             force = own[u, FORCE] if own.shape[1] > FORCE else work.applied[u]  # what the actuator gives, where it has dynamics
             widen(extremes.force_min, extremes.force_max, u, force)
             if u + 1 < b:
                 widen(extremes.coupler_min, extremes.coupler_max, u, own[u, 0] - own[u + 1, 0] - length[u])
-        lead(i, loop, t, work)
-        watch(i, loop.law, work.leader, first, own, links, extremes.watched[i])
-        for q in range(extremes.watched.shape[1]):
-            widen(extremes.watched_min[i], extremes.watched_max[i], q, extremes.watched[i, q])
+        if extremes.watched.shape[1] > 0:
+            lead(i, loop, t, work)
+            watch(i, loop.law, work.leader, first, own, links, extremes.watched[i])
+            for q in range(extremes.watched.shape[1]):
+                widen(extremes.watched_min[i], extremes.watched_max[i], q, extremes.watched[i, q])
 
 
 @bare(inline="always")
@@ -236,42 +238,64 @@ def copy(out, table):  # type: ignore[no-untyped-def]
         o[k] = b[k]
 
 
+@bare(inline="always")
+def talking(air):  # type: ignore[no-untyped-def]
+    """Whether trains hear each other within a stretch of integration."""
+    return air.live and air.heard.shape[1] > 0
+
+
 @bare()
 def advance_kernel(functions, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes):  # type: ignore[no-untyped-def]
-    """See ``advance``."""
+    """See ``advance``. Trains that do not hear each other meanwhile are taken a few at a time, so that they stay in the cache."""
     parts = closed_loop(functions, loop, first, links)
+    trains = len(first) - 1
+    size = trains if talking(air) else TOGETHER
+    for low in range(0, trains, max(size, 1)):
+        stretch(
+            parts, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes, low,
+            min(low + size, trains),
+        )  # fmt: skip
+
+
+@bare()
+def stretch(parts, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes, low, high):  # type: ignore[no-untyped-def]
+    """Integrate trains ``low`` to ``high``."""
+    a, b = first[low], first[high]
+    x, q, energy, power = own[a:b], estimate[a:b], extremes.energy[low:high], work.power[low:high]
+    x_0, x_rate, x_sum = work.own[a:b], work.own_rate[a:b], work.own_sum[a:b]
+    q_0, q_rate, q_sum = work.estimate[a:b], work.estimate_rate[a:b], work.estimate_sum[a:b]
     for k in range(n):
         begin, end = t + k * h, t + (k + 1) * h
         while begin < end:
             stop = end
-            for b in breaks:
-                if begin + 1e-9 < b < end - 1e-9:
-                    stop = b
+            for jump in breaks:
+                if begin + 1e-9 < jump < end - 1e-9:
+                    stop = jump
                     break
             dt = stop - begin
-            copy(work.own, own)
-            copy(work.estimate, estimate)
+            copy(x_0, x)
+            copy(q_0, q)
             for s in range(4):
                 ahead = 0.0 if s == 0 else (dt if s == 3 else 0.5 * dt)
                 if s > 0:
-                    along(own, work.own, ahead, work.own_rate)
-                    along(estimate, work.estimate, ahead, work.estimate_rate)
-                stage(parts, loop, first, links, reference, air, begin + ahead, begin + 0.5 * dt, own, estimate, work)
+                    along(x, x_0, ahead, x_rate)
+                    along(q, q_0, ahead, q_rate)
+                stage(parts, loop, first, links, reference, air, begin + ahead, begin + 0.5 * dt, own, estimate, work, low, high)
                 if s == 0:
-                    see(parts, loop, first, length, links, begin, own, work, extremes)
-                    for i in range(len(work.limited)):
+                    see(parts, loop, first, length, links, begin, own, work, extremes, low, high)
+                    for i in range(low, high):
                         extremes.limited[i] += dt * work.limited[i]
                     if k == 0 and begin == t:
-                        for u in range(len(work.applied)):
+                        for u in range(a, b):
                             work.applied_first[u] = work.applied[u]
-                    copy(work.own_sum, work.own_rate)
-                    copy(work.estimate_sum, work.estimate_rate)
+                    copy(x_sum, x_rate)
+                    copy(q_sum, q_rate)
                 else:
-                    along(work.own_sum, work.own_sum, 2.0 if s < 3 else 1.0, work.own_rate)
-                    along(work.estimate_sum, work.estimate_sum, 2.0 if s < 3 else 1.0, work.estimate_rate)
-                along(extremes.energy, extremes.energy, (dt if s in (0, 3) else 2.0 * dt) / 6.0, work.power)
-            along(own, work.own, dt / 6.0, work.own_sum)
-            along(estimate, work.estimate, dt / 6.0, work.estimate_sum)
+                    along(x_sum, x_sum, 2.0 if s < 3 else 1.0, x_rate)
+                    along(q_sum, q_sum, 2.0 if s < 3 else 1.0, q_rate)
+                along(energy, energy, (dt if s in (0, 3) else 2.0 * dt) / 6.0, power)
+            along(x, x_0, dt / 6.0, x_sum)
+            along(q, q_0, dt / 6.0, q_sum)
             begin = stop
 
 
@@ -353,7 +377,7 @@ def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...]) ->
 
 
 #: Whose caches on disk name the types of laws, observers and plants.
-KERNELS: tuple[Any, ...] = (stage, see, advance_kernel, exchange_kernel)
+KERNELS: tuple[Any, ...] = (stage, see, stretch, advance_kernel, exchange_kernel)
 
 
 def from_cache(function: Any, arguments: tuple[Any, ...]) -> Callable[..., None]:

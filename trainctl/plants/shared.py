@@ -20,6 +20,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from trainctl.kernels import bare
 from trainctl.plants import coupled_units
 from trainctl.plants.coupled_units import (
     BRAKING,
@@ -37,7 +38,6 @@ from trainctl.plants.coupled_units import (
     running_resistance,
     slope_at,
 )
-from trainctl.plants.integrate import bare
 from trainctl.signals import GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Links
 
 CLOCK: Literal["continuous"] = "continuous"
