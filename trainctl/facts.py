@@ -24,10 +24,14 @@ def facts(p: Prepared) -> dict[str, Any]:
         "trains": _some(p.scenario.ids),
         "law": f"{p.scenario.controller.law} ({p.law.CLOCK})",
         "plant": p.scenario.plant.kind,
-        **(_traffic(p) if p.roster is not None else {
-            "line": f"{p.line.begin_m / 1000:g} .. {p.line.end_m / 1000:g} km, tracks {', '.join(p.line.track_ids)}",
-            "links_at_start": " ".join(f"{a}-{b}" for a, b in links),
-        }),
+        **(
+            _traffic(p)
+            if p.roster is not None
+            else {
+                "line": f"{p.line.begin_m / 1000:g} .. {p.line.end_m / 1000:g} km, tracks {', '.join(p.line.track_ids)}",
+                "links_at_start": " ".join(f"{a}-{b}" for a, b in links),
+            }
+        ),
         "steps": run.steps,
         "step_s": run.step_s,
     }

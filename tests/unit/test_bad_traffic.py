@@ -152,7 +152,9 @@ def test_a_run_that_broke_off_is_not_resumed(typed, tmp_path, monkeypatch):
     assert code == 3
     code, lines = typed("resume", "r")
     assert code == 2
-    assert lines == [f"{tmp_path / 'r.partial'}: a run with network.sumocfg cannot be resumed yet: begin it again with `trainctl run`"]
+    assert lines == [
+        f"{tmp_path / 'r.partial'}: a run with network.sumocfg cannot be resumed yet: begin it again with `trainctl run`"
+    ]
     code, lines = typed("replay", "r.partial", "--gui-program", "sumo")
     assert code == 2
 
