@@ -125,7 +125,7 @@ class Units:
         """Take over a new edge list; ``constants`` are the law's own (a sampled law does not run here)."""
         p = self.p
         own_law = shared.constants(p.plant_params, p.consists, self.gradient) if p.sampled else constants
-        self.loop = integrate.Loop(own_law, p.observer.constants(p.observer_params, scene), self.plant, self.orders)
+        self.loop = integrate.Loop(own_law, p.observer.constants(p.observer_params, scene), self.plant, self.orders, not p.sampled)
         messages = len(scene.links.sender), self.law.MESSAGE
         self.air = integrate.Air(np.zeros(messages), self.period is None, self.law.ORDER == "chain", 0.0)
         self.work = integrate.scratch(p.own, self.estimate, len(self.masses), p.observer.CORRECTIONS, self.law.MESSAGE)

@@ -271,15 +271,15 @@ class Observer(Protocol):
 
 
 class Plant(Protocol):
-    """Motion of the units of train ``i``; compiled like a continuous law. ``own`` has ``STATES`` columns."""
+    """Motion of the units of train ``i``; compiled like a continuous law. ``own`` has ``STATES`` columns.
+
+    Its constants have ``units`` and ``gradient`` as in ``plants.coupled_units``.
+    """
 
     STATES: int
 
     def limit(self, i: int, constants: Any, own: Floats, applied: Floats) -> bool:
         """Clip ``applied`` [N] to what the units can do, in place; True if a limit acted."""
-
-    def weight(self, i: int, constants: Any, own: Floats, out: Floats) -> bool:
-        """Write the weight of each unit along the track [N] into ``out``; False if no unit is on a slope."""
 
     def rate(
         self, i: int, constants: Any, t: float, inside: float, own: Floats, applied: Floats, out: Floats, power: Floats

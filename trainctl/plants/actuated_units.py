@@ -185,18 +185,6 @@ def limit(i: int, constants: Constants, own: Floats, applied: Floats) -> bool:
 
 
 @bare(error_model="numpy")
-def weight(i: int, constants: Constants, own: Floats, out: Floats) -> bool:
-    """Write the weight along the track of every unit of train ``i`` [N] into ``out``; False if no unit is on a slope."""
-    climbs = False
-    for j in range(len(out)):
-        unit = constants.units[constants.first[i] + j]
-        slope = unit[SLOPE] + slope_at(own[j, POSITION], constants.gradient)
-        out[j] = unit[MASS] * GRAVITY * slope
-        climbs = climbs or slope != 0.0
-    return climbs
-
-
-@bare(error_model="numpy")
 def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, applied: Floats, out: Floats, power: Floats) -> None:
     """d(own)/dt, eqs. (1), (2), and the train's powers [W]: see ``signals.Plant``.
 

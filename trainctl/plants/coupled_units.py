@@ -135,18 +135,6 @@ def limit(i: int, constants: Constants, own: Floats, applied: Floats) -> bool:
 
 
 @bare(error_model="numpy")
-def weight(i: int, constants: Constants, own: Floats, out: Floats) -> bool:
-    """Write the weight along the track of every unit of train ``i`` [N] into ``out``; False if no unit is on a slope."""
-    a, climbs = constants.first[i], False
-    units, gradient = constants.units, constants.gradient
-    for j in range(len(out)):
-        slope = units[a + j, SLOPE] + slope_at(own[j, POSITION], gradient)
-        out[j] = units[a + j, MASS] * GRAVITY * slope
-        climbs = climbs or slope != 0.0
-    return climbs
-
-
-@bare(error_model="numpy")
 def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, applied: Floats, out: Floats, power: Floats) -> None:
     """Write speed and acceleration of every unit of train ``i`` into ``out``, the train's powers into ``power``: eqs. (1)-(4).
 

@@ -18,7 +18,8 @@ from numba.core import cgutils as untyped_cgutils
 from numba.extending import intrinsic, overload
 
 from trainctl.kernels import bare
-from trainctl.signals import FORCE, POWERS, Floats, Ints, Links, Reference, leader_at
+from trainctl.plants.coupled_units import MASS, SLOPE, slope_at
+from trainctl.signals import FORCE, GRAVITY, POSITION, POWERS, Floats, Ints, Links, Reference, leader_at
 
 types: Any = numba.types
 typeof: Any = numba.typeof
@@ -32,7 +33,7 @@ TOGETHER = 64
 class Parts(NamedTuple):
     """The closed loop's functions, compiled: see ``compiled``."""
 
-    functions: Any  # addresses of the eight functions, or these themselves where nothing is compiled
+    functions: Any  # addresses of the seven functions, or these themselves where nothing is compiled
     advance: Callable[..., None]
     exchange: Callable[..., None]
 
@@ -46,12 +47,17 @@ class Orders(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """Constants of the three parts, and the orders of this step."""
+    """Constants of the three parts, and the orders of this step.
+
+    ``lifts`` says whether the loop adds to the law's demand what holds the units on slopes; a train-level law's share-out does so
+    itself, within what the limits leave.
+    """
 
     law: Any
     observer: Any
     plant: Any
     orders: Orders = Orders(np.zeros(0), np.zeros((0, 3)), 0.0)
+    lifts: bool = True
 
 
 class Air(NamedTuple):
@@ -134,12 +140,13 @@ def stage(parts, loop, first, links, reference, air, t, inside, own, estimate, w
     The weight along the track is known and made up for: it is added to what the law demands, within the limits. Observers, which
     know of no slopes, see the rest.
     """
-    demand, message, _, correction, estimate_rate, limit, rate, weight = parts
+    demand, message, _, correction, estimate_rate, limit, rate = parts
     observed = estimate.shape[1] > 0
     leader_at(reference, t, inside, work.leader)
     age = 0.0 if air.live else t - air.sent_at
     force, talk = loop.orders.force, talking(air)
-    hilly = len(loop.plant.gradient) > 0 or len(loop.orders.pace) > 0  # trains that come and go have their slopes by the unit
+    units, gradient, weight = loop.plant.units, loop.plant.gradient, work.weight
+    climbs = loop.lifts and (len(gradient) > 0 or len(loop.orders.pace) > 0)  # trains that come and go: slopes by the unit
     for i in range(low, high):
         a, b = first[i], first[i + 1]
         if observed:
@@ -160,24 +167,26 @@ def stage(parts, loop, first, links, reference, air, t, inside, own, estimate, w
             i, loop.law, work.leader, age, links.slot[i], own[a:b], estimate[a:b], work.correction[a:b],
             links.desired[e:f], air.heard[e:f], work.applied[a:b],
         )  # fmt: skip
-        climbs = hilly and weight(i, loop.plant, own[a:b], work.weight[a:b])
+        if climbs:
+            for u in range(a, b):
+                weight[u] = units[u, MASS] * GRAVITY * (units[u, SLOPE] + slope_at(own[u, POSITION], gradient))
         if len(force) > 0 and force[a] == force[a]:  # not NaN
             for u in range(a, b):
                 work.applied[u] = force[u]
         elif climbs:
             for u in range(a, b):
-                work.applied[u] += work.weight[u]
+                work.applied[u] += weight[u]
         work.limited[i] = 1.0 if limit(i, loop.plant, own[a:b], work.applied[a:b]) else 0.0
         if observed:
             if climbs:
                 for u in range(a, b):
-                    work.applied[u] -= work.weight[u]
+                    work.applied[u] -= weight[u]
             estimate_rate(
                 i, loop.observer, own[a:b], estimate[a:b], work.correction[a:b], work.applied[a:b], work.estimate_rate[a:b]
             )  # fmt: skip
             if climbs:
                 for u in range(a, b):
-                    work.applied[u] += work.weight[u]
+                    work.applied[u] += weight[u]
         if talk and air.chain:
             message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
         rate(i, loop.plant, t, inside, own[a:b], work.applied[a:b], work.own_rate[a:b], work.power[i])
@@ -300,9 +309,9 @@ def stretch(parts, loop, first, length, links, reference, air, t, h, n, breaks, 
 
 
 def signatures(loop: Any, first: Any, links: Any) -> tuple[Any, ...]:
-    """Types of the eight functions for these types of ``Loop``, ``first`` and ``Links``, in the order of ``Parts.functions``."""
+    """Types of the seven functions for these types of ``Loop``, ``first`` and ``Links``, in the order of ``Parts.functions``."""
     whole, real, row, table = types.int64, types.float64, types.float64[::1], types.float64[:, ::1]
-    law, observer, plant, _ = loop
+    law, observer, plant, *_ = loop
     return (
         types.void(whole, law, row, real, real, table, table, table, row, table, row),
         types.void(whole, law, row, real, table, table, table, row),
@@ -311,7 +320,6 @@ def signatures(loop: Any, first: Any, links: Any) -> tuple[Any, ...]:
         types.void(whole, observer, table, table, table, row, table),
         types.boolean(whole, plant, table, row),
         types.void(whole, plant, real, real, table, row, table, row),
-        types.boolean(whole, plant, table, row),
     )
 
 
@@ -339,7 +347,7 @@ def from_addresses(typingctx, functions, loop, first, links):  # type: ignore[no
 
 
 def closed_loop(functions: Any, loop: Any, first: Any, links: Any) -> Any:
-    """Make the eight functions of ``Parts.functions`` ready to be called."""
+    """Make the seven functions of ``Parts.functions`` ready to be called."""
     return functions
 
 
@@ -355,8 +363,7 @@ def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...]) ->
     They serve as long as the types of the arguments stay: new values, links and constants of the same shape of data need no
     new call. Compiled code is cached on disk between processes, each module's own.
     """
-    weight = getattr(law, "weight", plant.weight)  # a law that makes up for slopes itself says so with a function of its own
-    functions = (law.demand, law.message, law.watch, observer.correction, observer.rate, plant.limit, plant.rate, weight)
+    functions = (law.demand, law.message, law.watch, observer.correction, observer.rate, plant.limit, plant.rate)
     if config.DISABLE_JIT:
         return Parts(functions, advance_kernel, exchange_kernel)
     loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes = (typeof(a) for a in arguments)

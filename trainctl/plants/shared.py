@@ -121,12 +121,6 @@ def message(
 
 
 @bare(error_model="numpy")
-def weight(i: int, constants: object, own: Floats, out: Floats) -> bool:
-    """Nothing to add for slopes: ``demand`` makes up for them, since it shares out what the limits leave beside them."""
-    return False
-
-
-@bare(error_model="numpy")
 def watch(i: int, constants: Constants, leader: Floats, first: Ints, own: Floats, links: Links, out: Floats) -> None:
     """Nothing to watch here."""
 
