@@ -126,9 +126,7 @@ def with_targets(targets: Targets, train: Ints, room: Floats, kind: int) -> Targ
     )
 
 
-def judge(
-    params: Params, speed: Floats, targets: Targets, clear: Targets, limits: Limits, step: float, theta: float
-) -> Verdict:
+def judge(params: Params, speed: Floats, targets: Targets, clear: Targets, limits: Limits, step: float, theta: float) -> Verdict:
     """What every train may do: following the one that joins ahead, or keeping the join clear, whichever leaves more.
 
     ``target`` of the verdict counts rows of ``clear`` on from those of ``targets``.

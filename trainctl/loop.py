@@ -368,9 +368,7 @@ class Simulation:
     ) -> tuple[Floats, Motion]:
         """The plant over one step; trains that stand, or are not there, stay as they are."""
         pace = None if self.service is None else self.service.leader()
-        moved, motion = self.motion.advance(
-            self.k, t, own, self.demand, self.links, self.exchange, disturbed, ordered, pace
-        )
+        moved, motion = self.motion.advance(self.k, t, own, self.demand, self.links, self.exchange, disturbed, ordered, pace)
         if stands is None:
             return moved, motion
         moved[np.abs(moved[:, SPEED]) < STANDS, SPEED] = 0.0  # a stand ordered is one, rounding aside

@@ -101,9 +101,13 @@ class Units:
         self.extremes = self._fresh()
         self.counted = -1  # number of the last exchange
         guided = p.roster is not None
+        self.hilly = bool(len(self.gradient)) or (guided and bool(p.rails.slope.any()))
         ordered = guided or p.supervision.mode != "off"
         self.orders = integrate.Orders(
-            np.full(len(p.own) if ordered and not p.sampled else 0, np.nan), np.zeros((len(self.masses) if guided else 0, 3)), 0.0
+            force=np.full(len(p.own) if ordered and not p.sampled else 0, np.nan),
+            lift=np.zeros(len(p.own) if self.hilly and not p.sampled else 0),
+            pace=np.zeros((len(self.masses) if guided else 0, 3)),
+            since=0.0,
         )
 
     def believed_resistance(self, own: Floats) -> Floats:
@@ -125,7 +129,7 @@ class Units:
         """Take over a new edge list; ``constants`` are the law's own (a sampled law does not run here)."""
         p = self.p
         own_law = shared.constants(p.plant_params, p.consists, self.gradient) if p.sampled else constants
-        self.loop = integrate.Loop(own_law, p.observer.constants(p.observer_params, scene), self.plant, self.orders, not p.sampled)
+        self.loop = integrate.Loop(own_law, p.observer.constants(p.observer_params, scene), self.plant, self.orders)
         messages = len(scene.links.sender), self.law.MESSAGE
         self.air = integrate.Air(np.zeros(messages), self.period is None, self.law.ORDER == "chain", 0.0)
         self.work = integrate.scratch(p.own, self.estimate, len(self.masses), p.observer.CORRECTIONS, self.law.MESSAGE)
@@ -151,6 +155,8 @@ class Units:
             self.loop.law.acceleration[:] = np.where(np.isnan(ordered), demand.acceleration, ordered)
         elif len(self.orders.force):
             self.orders.force[:] = self._forces(own, np.repeat(ordered, np.diff(first)))
+        if len(self.orders.lift):
+            self.orders.lift[:] = p.consists.mass * self._climbing(own)
         if pace is not None and len(self.orders.pace):
             self.orders.pace[:] = pace[:3].T
             self.loop = self.loop._replace(orders=self.orders._replace(since=t))

@@ -169,9 +169,7 @@ class Reroutes:
                 f" nobody would keep them apart: {cure}"
             )
 
-    def _to_an_edge(
-        self, event: Event, i: int, seen: Seen, ways: Ways, lock: float
-    ) -> tuple[tuple[str, ...], dict[str, Any]]:
+    def _to_an_edge(self, event: Event, i: int, seen: Seen, ways: Ways, lock: float) -> tuple[tuple[str, ...], dict[str, Any]]:
         rails = self.p.rails
         target = rails.index.get(str(event.to_edge), -1)
         if target < 0:

@@ -271,10 +271,7 @@ class Observer(Protocol):
 
 
 class Plant(Protocol):
-    """Motion of the units of train ``i``; compiled like a continuous law. ``own`` has ``STATES`` columns.
-
-    Its constants have ``units`` and ``gradient`` as in ``plants.coupled_units``.
-    """
+    """Motion of the units of train ``i``; compiled like a continuous law. ``own`` has ``STATES`` columns."""
 
     STATES: int
 

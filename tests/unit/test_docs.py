@@ -81,7 +81,7 @@ def typed(line: str, monkeypatch: pytest.MonkeyPatch) -> int:
     if words[0] != "trainctl" or words[1] == "sweep":  # Dask starts processes and warns of a port that is taken
         programs = os.environ | {
             "SUMO_HOME": SUMO_HOME,
-            "PATH": os.pathsep.join((f"{SUMO_HOME}/bin", str(Path(sys.executable).parent), os.environ["PATH"]))
+            "PATH": os.pathsep.join((f"{SUMO_HOME}/bin", str(Path(sys.executable).parent), os.environ["PATH"])),
         }
         return subprocess.run(words, env=programs, check=False, stdout=subprocess.DEVNULL).returncode
     monkeypatch.setattr(sys, "argv", words)

@@ -17,8 +17,15 @@ def on(line, track, position):
     edge, lane = line.locate(track, position)
     world.start(
         Start(
-            ["a"], np.array([edge]), np.array([lane]), np.array([80.0]), np.zeros(1), [np.zeros(1)], [line.route(track, position)],
-            np.ones(1, bool), ["rail"],
+            ["a"],
+            np.array([edge]),
+            np.array([lane]),
+            np.array([80.0]),
+            np.zeros(1),
+            [np.zeros(1)],
+            [line.route(track, position)],
+            np.ones(1, bool),
+            ["rail"],
         )
     )
     return world

@@ -18,8 +18,7 @@ from numba.core import cgutils as untyped_cgutils
 from numba.extending import intrinsic, overload
 
 from trainctl.kernels import bare
-from trainctl.plants.coupled_units import MASS, SLOPE, slope_at
-from trainctl.signals import FORCE, GRAVITY, POSITION, POWERS, Floats, Ints, Links, Reference, leader_at
+from trainctl.signals import FORCE, POWERS, Floats, Ints, Links, Reference, leader_at
 
 types: Any = numba.types
 typeof: Any = numba.typeof
@@ -42,22 +41,18 @@ class Orders(NamedTuple):
     """What is ordered from outside of the law over one simulator step. Arrays of length 0 order nothing."""
 
     force: Floats  # (U,) N, instead of the law's demand; NaN leaves a train to its law
+    lift: Floats  # (U,) N, what holds each unit on its slope: added to the law's demand
     pace: Floats  # (n, 3) position [m], speed [m/s] and acceleration [m/s2] at ``since`` of each train's own reference
     since: float  # s
 
 
 class Loop(NamedTuple):
-    """Constants of the three parts, and the orders of this step.
-
-    ``lifts`` says whether the loop adds to the law's demand what holds the units on slopes; a train-level law's share-out does so
-    itself, within what the limits leave.
-    """
+    """Constants of the three parts, and the orders of this step."""
 
     law: Any
     observer: Any
     plant: Any
-    orders: Orders = Orders(np.zeros(0), np.zeros((0, 3)), 0.0)
-    lifts: bool = True
+    orders: Orders = Orders(np.zeros(0), np.zeros(0), np.zeros((0, 3)), 0.0)
 
 
 class Air(NamedTuple):
@@ -103,7 +98,6 @@ class Scratch(NamedTuple):
     power: Floats  # (n, 6)
     sent: Floats  # (n, w)
     limited: Floats  # (n,)
-    weight: Floats  # (U,) N, along the track
     own: Floats  # (U, s) at the beginning of the step
     own_sum: Floats  # (U, s) weighted sum of the stages' rates
     estimate: Floats  # (U, q)
@@ -116,21 +110,37 @@ def scratch(own: Floats, estimate: Floats, trains: int, corrections: int, messag
     units = len(own)
     return Scratch(
         np.zeros(4), np.zeros((units, corrections)), np.zeros(units), np.zeros_like(own), np.zeros_like(estimate),
-        np.zeros((trains, len(POWERS))), np.zeros((trains, message)), np.zeros(trains), np.zeros(units), np.zeros_like(own),
-        np.zeros_like(own), np.zeros_like(estimate), np.zeros_like(estimate), np.zeros(units),
+        np.zeros((trains, len(POWERS))), np.zeros((trains, message)), np.zeros(trains), np.zeros_like(own), np.zeros_like(own),
+        np.zeros_like(estimate), np.zeros_like(estimate), np.zeros(units),
     )  # fmt: skip
 
 
-@bare(inline="always")
-def lead(i, loop, t, work):  # type: ignore[no-untyped-def]
-    """Let ``work.leader`` be that of train ``i``, if trains have their own."""
-    pace = loop.orders.pace
-    if pace.shape[0] > 0:
-        since = t - loop.orders.since
-        work.leader[0] = pace[i, 0] + since * (pace[i, 1] + 0.5 * since * pace[i, 2])
-        work.leader[1] = pace[i, 1] + since * pace[i, 2]
-        work.leader[2] = pace[i, 2]
-        work.leader[3] = 0.0
+@bare()
+def lead(i, orders, t, leader):  # type: ignore[no-untyped-def]
+    """Let ``leader`` be that of train ``i``."""
+    pace, since = orders.pace, t - orders.since
+    leader[0] = pace[i, 0] + since * (pace[i, 1] + 0.5 * since * pace[i, 2])
+    leader[1] = pace[i, 1] + since * pace[i, 2]
+    leader[2] = pace[i, 2]
+    leader[3] = 0.0
+
+
+@bare()
+def follow(force, lift, a, b, applied):  # type: ignore[no-untyped-def]
+    """Put the forces that are ordered, or the lift, where units ``a`` to ``b`` have the law's demand."""
+    if len(force) > 0 and force[a] == force[a]:  # not NaN
+        for u in range(a, b):
+            applied[u] = force[u]
+    else:
+        add(lift, 1.0, a, b, applied)
+
+
+@bare()
+def add(lift, sign, a, b, applied):  # type: ignore[no-untyped-def]
+    """Add ``sign`` times the lift, if there is one, to the forces of units ``a`` to ``b``."""
+    if len(lift) > 0:
+        for u in range(a, b):
+            applied[u] += sign * lift[u]
 
 
 @bare()
@@ -144,15 +154,15 @@ def stage(parts, loop, first, links, reference, air, t, inside, own, estimate, w
     observed = estimate.shape[1] > 0
     leader_at(reference, t, inside, work.leader)
     age = 0.0 if air.live else t - air.sent_at
-    force, talk = loop.orders.force, talking(air)
-    units, gradient, weight = loop.plant.units, loop.plant.gradient, work.weight
-    climbs = loop.lifts and (len(gradient) > 0 or len(loop.orders.pace) > 0)  # trains that come and go: slopes by the unit
+    lift, talk = loop.orders.lift, talking(air)
+    ordered, guided = len(loop.orders.force) > 0 or len(lift) > 0, len(loop.orders.pace) > 0
     for i in range(low, high):
         a, b = first[i], first[i + 1]
         if observed:
             correction(i, loop.observer, own[a:b], estimate[a:b], work.correction[a:b])
         if talk and not air.chain:
-            lead(i, loop, t, work)
+            if guided:
+                lead(i, loop.orders, t, work.leader)
             message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
     for p in range(low, high):
         i = links.order[p] if talk else p
@@ -162,31 +172,23 @@ def stage(parts, loop, first, links, reference, air, t, inside, own, estimate, w
             for k in range(e, f):
                 for q in range(air.heard.shape[1]):
                     air.heard[k, q] = work.sent[links.sender[k], q]
-        lead(i, loop, t, work)
+        if guided:
+            lead(i, loop.orders, t, work.leader)
         demand(
             i, loop.law, work.leader, age, links.slot[i], own[a:b], estimate[a:b], work.correction[a:b],
             links.desired[e:f], air.heard[e:f], work.applied[a:b],
         )  # fmt: skip
-        if climbs:
-            for u in range(a, b):
-                weight[u] = units[u, MASS] * GRAVITY * (units[u, SLOPE] + slope_at(own[u, POSITION], gradient))
-        if len(force) > 0 and force[a] == force[a]:  # not NaN
-            for u in range(a, b):
-                work.applied[u] = force[u]
-        elif climbs:
-            for u in range(a, b):
-                work.applied[u] += weight[u]
+        if ordered:
+            follow(loop.orders.force, lift, a, b, work.applied)
         work.limited[i] = 1.0 if limit(i, loop.plant, own[a:b], work.applied[a:b]) else 0.0
         if observed:
-            if climbs:
-                for u in range(a, b):
-                    work.applied[u] -= weight[u]
+            if ordered:
+                add(lift, -1.0, a, b, work.applied)
             estimate_rate(
                 i, loop.observer, own[a:b], estimate[a:b], work.correction[a:b], work.applied[a:b], work.estimate_rate[a:b]
             )  # fmt: skip
-            if climbs:
-                for u in range(a, b):
-                    work.applied[u] += weight[u]
+            if ordered:
+                add(lift, 1.0, a, b, work.applied)
         if talk and air.chain:
             message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
         rate(i, loop.plant, t, inside, own[a:b], work.applied[a:b], work.own_rate[a:b], work.power[i])
@@ -200,7 +202,8 @@ def exchange_kernel(functions, loop, first, links, reference, air, t, own, estim
     stage(parts, loop, first, links, reference, air, t, t, own, estimate, work, 0, len(first) - 1)
     for i in range(len(first) - 1):
         a, b = first[i], first[i + 1]
-        lead(i, loop, t, work)
+        if len(loop.orders.pace) > 0:
+            lead(i, loop.orders, t, work.leader)
         message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
 
 
@@ -216,7 +219,8 @@ def see(parts, loop, first, length, links, t, own, work, extremes, low, high):  
             if u + 1 < b:
                 widen(extremes.coupler_min, extremes.coupler_max, u, own[u, 0] - own[u + 1, 0] - length[u])
         if extremes.watched.shape[1] > 0:
-            lead(i, loop, t, work)
+            if len(loop.orders.pace) > 0:
+                lead(i, loop.orders, t, work.leader)
             watch(i, loop.law, work.leader, first, own, links, extremes.watched[i])
             for q in range(extremes.watched.shape[1]):
                 widen(extremes.watched_min[i], extremes.watched_max[i], q, extremes.watched[i, q])

@@ -132,9 +132,7 @@ class Sumo:
             raise SimulatorError("; ".join(wrong))
         self.kinds = write_routes(start, self.folder / "trains.rou.xml")
         end = (self.steps + 1) * self.time_step
-        configuration = write_configuration(
-            self.folder, self.net.name, "trains.rou.xml", self.time_step, end, self.internal
-        )
+        configuration = write_configuration(self.folder, self.net.name, "trains.rou.xml", self.time_step, end, self.internal)
         self.ids, self.routes, self.departs_m = list(start.ids), list(start.routes), start.lane_position
         self.ways = lay_out(self.line, start)
         self.coming: list[tuple[int, float]] = []
