@@ -208,7 +208,10 @@ def test_ten_thousand_trains_are_watched_in_milliseconds(units):
     ids = tuple(map(str, range(n)))
     scenario = SimpleNamespace(ids=ids, train=ids, plant=units.scenario.plant, bounds=units.scenario.bounds)
     bounds = type(units.bounds)(*(np.full(n, b[0]) for b in units.bounds))
-    p = SimpleNamespace(scenario=scenario, consists=c, bounds=bounds, law=units.law, sampled=True, own=own, heads=c.first[:-1])
+    p = SimpleNamespace(
+        scenario=scenario, consists=c, bounds=bounds, law=units.law, sampled=True, own=own, heads=c.first[:-1], roster=None,
+        supervision=SimpleNamespace(mode="off"),
+    )  # fmt: skip
     k = np.arange(n - 1)
     links = units.first_links._replace(
         sender=k, receiver=k + 1, desired=np.full(n - 1, 5000.0), lower=np.full(n - 1, 420.0), upper=np.full(n - 1, 1e4)

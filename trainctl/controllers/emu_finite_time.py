@@ -401,7 +401,7 @@ def largest_sub_step(params: Params, scene: Scene) -> float:
         edges = np.diff(np.eye(b - a), axis=0)
         for weights, chatter in ((w[a : b - 1], CHATTER_AT_BARRIER), (np.ones(b - a - 1), CHATTER_SETTLED)):
             stiffest = np.linalg.eigvalsh(edges.T @ np.diag(weights - k_p1) @ edges)[-1]
-            fastest = max(fastest, c.p3 * stiffest * c.alpha2 * chatter ** (c.alpha2 - 1.0))
+            fastest = max(fastest, float(c.p3 * stiffest * c.alpha2 * chatter ** (c.alpha2 - 1.0)))
     return RUNGE_KUTTA_LIMIT / fastest if fastest > 0.0 else math.inf
 
 
