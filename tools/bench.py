@@ -41,6 +41,8 @@ SIZES = (10, 100, 1000, 10_000)
 IN_SUMO = ("bare", "rail", "loop", "traci", "client")
 ALONE = ("bare", "rail", "client")  # without our loop
 NUMERIC = ("coupled_units", "finite_time", "actuated_units")
+#: Compared to a few per cent; through TraCI everything is many times slower, which one turn tells.
+REPEATED = ("bare", "rail", "loop")
 PARTS = ("read", "topology", "control", "plant", "write", "step", "record")
 SPEED_MPS = 80.0
 SPACING_M = dict.fromkeys((*IN_SUMO, *NUMERIC), 500.0) | {"finite_time": 900.0, "actuated_units": 900.0}
@@ -410,7 +412,7 @@ def bench(root: Path, sizes: list[int], cases: list[str], repeats: int) -> list[
         found: dict[str, list[dict[str, Any]]] = {case: [] for case in cases}
         for turn in range(repeats):
             for case in cases:
-                if turn == 0 or (case in IN_SUMO and case != "client"):  # the numeric ones repeat within one process
+                if turn == 0 or case in REPEATED:  # the numeric ones repeat within one process
                     print(f"{trains} trains, {case}, {turn + 1}", file=sys.stderr)
                     found[case].append(measure(root, case, trains))
         rows += [row(case, trains, results) for case, results in found.items()]
