@@ -128,6 +128,18 @@ def scenario(law: str, duration: float, types: tuple[str, ...] = ("emu",), **cha
     return tables
 
 
+#: A line of ours with slopes, limits and crossovers at odd places.
+HILLY = {
+    "name": "hilly", "tracks": ["left", "right"], "length_m": 12000.0, "start_m": 250.5, "max_edge_m": 20000.0,
+    "speed": [[250.5, 83.333333333333], [4000.0, 40.0]],
+    "gradient": [[1000.0, 50.0], [2000.5, -50.0], [3000.0, 0.0], [5000.0, 12.5], [6100.123, -33.3]],
+    "crossover": [
+        {"id": "over", "from": "left", "to": "right", "position_m": 5800.123456, "length_m": 400.7, "speed_mps": 40.0},
+        {"id": "on", "from": "right", "to": "left", "position_m": 6200.823456, "length_m": 200.0, "speed_mps": 40.0},
+    ],
+}  # fmt: skip
+
+
 # Nets
 
 

@@ -18,9 +18,10 @@ from trainctl.motion import Motion, Points, Units
 from trainctl.plants import disturbance
 from trainctl.plants.integrate import Extremes
 from trainctl.prepare import Prepared
-from trainctl.railway import Lookout, Service, Supervision
+from trainctl.railway import Lookout, Supervision
 from trainctl.record.journal import Journal, Row
 from trainctl.reroute import Reroutes
+from trainctl.service import Service
 from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Ints, Links, Trains
 from trainctl.supervisor import applied
 from trainctl.topology import convoys, graph

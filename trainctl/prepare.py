@@ -26,7 +26,7 @@ from trainctl.errors import InputError
 from trainctl.plants import actuated_units, disturbance, point, shared
 from trainctl.reading import examine, mistakes, read
 from trainctl.reference import Profile
-from trainctl.scenario import Scenario
+from trainctl.scenario import Scenario, Traffic
 from trainctl.signals import FORCE, POSITION, SPEED, Bounds, Consists, Floats, Ints, Links, Reference, Scene, leader_at
 from trainctl.topology import graph
 
@@ -115,6 +115,16 @@ class Prepared:
     def theta(self) -> float:
         """Lead of the plant: x(k+1) = x + ((1 - theta) v(k) + theta v(k+1)) T_c under a held acceleration."""
         return point.lead(self.scenario.run.held_steps) if self.scenario.plant.kind == "point" else 0.5
+
+    @property
+    def step_theta(self) -> float:
+        """Lead of the plant over one step of the simulator, as the supervisor counts it."""
+        return 0.0 if self.scenario.plant.kind == "point" else 0.5
+
+    @cached_property
+    def driving(self) -> Traffic:
+        """How trains that come and go are driven."""
+        return self.scenario.traffic or Traffic()
 
     @cached_property
     def start_track(self) -> Ints:

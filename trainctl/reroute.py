@@ -43,7 +43,7 @@ class Reroutes:
         self.p = p
         self.pending = sorted(enumerate(p.scenario.event, 1), key=lambda e: e[1].time_s)
         self.length = p.consists.train_length()
-        self.theta = 0.0 if p.scenario.plant.kind == "point" else 0.5
+        self.theta = p.step_theta
 
     def add(self, event: Event) -> None:
         """One more order."""

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
-
-from trainctl import cli
 
 PAPER = 'extends = "fully_distributed"\n'
 TWO_TRAINS = """
@@ -35,20 +31,6 @@ c2_ns2_per_m2_kg = 0.0
 
 def train(number, position, speed=80.0):
     return f'[[train]]\nid = {number}\ntype = "point"\ntrack = 1\nposition_m = {position}\nspeed_mps = {speed}\n'
-
-
-@pytest.fixture
-def typed(tmp_path, monkeypatch, capsys):
-    """Type a command: exit code and the lines on stderr."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["trainctl", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-        return stop.value.code, capsys.readouterr().err.splitlines()
-
-    return call
 
 
 CASES = {

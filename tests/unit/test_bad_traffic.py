@@ -3,31 +3,21 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
 
-from trainctl import cli
 from trainctl.errors import SimulatorError
 
 MERGING = Path(__file__).resolve().parents[2] / "scenarios"
 
 
 @pytest.fixture
-def typed(tmp_path, monkeypatch, capsys):
-    """Type a command beside a copy of the scenario merging: exit code and the lines on stderr."""
-    monkeypatch.chdir(tmp_path)
+def typed(typed, tmp_path):
+    """Type a command where a copy of the scenario ``merging`` lies: exit code and the lines on stderr."""
     shutil.copytree(MERGING / "merging", tmp_path / "merging")
     shutil.copy(MERGING / "merging.toml", tmp_path / "mistaken.toml")
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["trainctl", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-        return stop.value.code, capsys.readouterr().err.splitlines()
-
-    return call
+    return typed
 
 
 def added(text):

@@ -429,7 +429,8 @@ def test_what_a_type_lacks_is_told_in_one_line() -> None:
 
 @pytest.mark.parametrize("name", ["rail", "rail_demo"])
 def test_the_railways_in_the_wheel(name: str, tmp_path: Path) -> None:
-    sumo = pytest.importorskip("sumo")
+    import sumo
+
     traffic = read_traffic(Path(sumo.SUMO_HOME) / "tools" / "game" / f"{name}.sumocfg", tmp_path)
     assert [d.kind for d in traffic.departures] == ["freightTrain", "passengerTrain", "passengerTrain"]
     for d in traffic.departures:

@@ -32,8 +32,8 @@ from trainctl.record.recorder import ENERGIES, Recorder, standard_tables
 from trainctl.record.run import Run
 from trainctl.reroute import Reroutes
 from trainctl.signals import GRAVITY, POWERS, Bools, Floats, Ints
-from trainctl.sumo.baseline_files import departures, messages, network, write_configuration, write_routes
-from trainctl.sumo.session import LOGS, TOLERANCE_M, normal
+from trainctl.sumo.baseline_files import departures, network, write_configuration, write_routes
+from trainctl.sumo.session import LOGS, TOLERANCE_M, messages, normal
 from trainctl.topology.ways import rerouted, ways
 from trainctl.world import Seen
 

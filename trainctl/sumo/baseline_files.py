@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
@@ -162,15 +161,3 @@ def write_configuration(p: Prepared, net: str, folder: Path) -> Path:
     body = "".join(f"    <{key} value={quoteattr(value)}/>\n" for key, value in options.items())
     path.write_text(f"<configuration>\n{body}</configuration>\n", encoding="utf-8")
     return path
-
-
-def messages(log: Path) -> list[tuple[float | None, str]]:
-    """Warnings and errors SUMO wrote, with the time it named, if any."""
-    if not log.is_file():
-        return []
-    found = []
-    for text in log.read_text(encoding="utf-8", errors="replace").splitlines():
-        if text.startswith(("Warning:", "Error:")):
-            at = re.search(r"time[= ]([0-9.]+)", text)
-            found.append((float(at.group(1).rstrip(".")) if at else None, text))
-    return found

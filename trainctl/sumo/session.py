@@ -111,6 +111,18 @@ def write_configuration(folder: Path, net: str, routes: str, step: float, end: f
     return path
 
 
+def messages(log: Path) -> list[tuple[float | None, str]]:
+    """Warnings and errors SUMO wrote, with the time it named, if any."""
+    if not log.is_file():
+        return []
+    found = []
+    for text in log.read_text(encoding="utf-8", errors="replace").splitlines():
+        if text.startswith(("Warning:", "Error:")):
+            at = re.search(r"time[= ]([0-9.]+)", text)
+            found.append((float(at.group(1).rstrip(".")) if at else None, text))
+    return found
+
+
 class Sumo:
     """One libsumo simulation. ``folder`` receives SUMO's inputs and its own logs.
 
@@ -303,15 +315,7 @@ class Sumo:
 
     def messages(self) -> list[tuple[float | None, str]]:
         """Warnings and errors SUMO wrote, with the time it named, if any."""
-        log = self.folder / LOGS["log"]
-        if not log.is_file():
-            return []
-        found = []
-        for text in log.read_text(encoding="utf-8", errors="replace").splitlines():
-            if text.startswith(("Warning:", "Error:")):
-                at = re.search(r"time[= ]([0-9.]+)", text)
-                found.append((float(at.group(1).rstrip(".")) if at else None, text))
-        return found
+        return messages(self.folder / LOGS["log"])
 
     def _time(self) -> float:
         return float(self.api.simulation.getTime()) - self.time_step

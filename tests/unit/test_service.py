@@ -10,7 +10,7 @@ import pytest
 import tomli_w
 
 from trainctl.prepare import Prepared, open_scenario
-from trainctl.railway import Service
+from trainctl.service import Service
 
 
 @pytest.fixture(scope="module")
