@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from trainctl.prepare import laws
+from trainctl.laws import laws
 from trainctl.record.metrics import DEFINITIONS
 
 PAGE = Path(__file__).resolve().parent.parent / "scenarios" / "README.md"

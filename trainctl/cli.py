@@ -283,7 +283,7 @@ def schema(
     law: Annotated[str | None, typer.Option(help="Also the keys of this law's [controller] table.")] = None,
 ) -> None:
     """Print the JSON Schema of scenario files."""
-    from trainctl.prepare import find_law, laws
+    from trainctl.laws import find_law, laws
     from trainctl.scenario import Scenario
 
     if law is not None:

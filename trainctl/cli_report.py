@@ -158,7 +158,8 @@ def _under_all(
     from trainctl import runner
     from trainctl.cli import _progress, _setting
     from trainctl.errors import TrainctlError
-    from trainctl.prepare import laws, prepare
+    from trainctl.laws import laws
+    from trainctl.prepare import prepare
     from trainctl.reading import examine, read
     from trainctl.record import compare as comparing
 

@@ -19,6 +19,9 @@ config: Any = numba.config
 #: ``njit`` without numba's run time, its allocation and reference counts, for what is called in every Runge-Kutta stage.
 bare: Any = partial(numba.njit, cache=True, _nrt=False)
 
+#: The same for the functions of laws, observers and plants, with numpy's rules of division: put into the stage that calls them.
+inlined: Any = partial(bare, error_model="numpy", forceinline=True)
+
 
 def keep_by_sources() -> None:
     """Point numba's cache at a folder of this version of the sources, unless NUMBA_CACHE_DIR says otherwise."""
@@ -26,9 +29,8 @@ def keep_by_sources() -> None:
         return
     here = Path(__file__).parent
     digest = hashlib.sha256(numba.__version__.encode())
-    for path in sorted(
-        [here / "signals.py", *(p for part in ("plants", "controllers", "observers") for p in (here / part).glob("*.py"))]
-    ):
+    compiled = [p for part in ("plants", "controllers", "observers") for p in (here / part).glob("*.py")]
+    for path in sorted([here / "signals.py", here / "kernels.py", *compiled]):
         digest.update(path.read_bytes())
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     config.CACHE_DIR = str(base / "trainctl" / f"kernels-{digest.hexdigest()[:16]}")

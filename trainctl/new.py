@@ -33,7 +33,7 @@ def controller(name: str, folder: Path) -> list[Path]:
     InputError
         The name cannot be used, or the folder is not empty.
     """
-    from trainctl.prepare import laws
+    from trainctl.laws import laws
 
     found = []
     if not (name.isidentifier() and name.isascii() and name == name.lower()) or keyword.iskeyword(name):

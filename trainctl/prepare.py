@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
-import importlib.util
 import json
 import math
-import pkgutil
-import sys
-import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -21,16 +16,15 @@ from pydantic import ValidationError
 
 import sumo_net
 from sumo_net import Line, LineError, Rails
-from trainctl import controllers, observers, prepare_line, roster, supervisor
+from trainctl import prepare_line, roster, supervisor
 from trainctl.errors import InputError
+from trainctl.laws import find_law, find_observer
 from trainctl.plants import actuated_units, disturbance, point, shared
 from trainctl.reading import examine, mistakes, read
 from trainctl.reference import Profile
 from trainctl.scenario import Scenario, Traffic
 from trainctl.signals import FORCE, POSITION, SPEED, Bounds, Consists, Floats, Ints, Links, Reference, Scene, leader_at
 from trainctl.topology import graph
-
-ENTRY_POINTS = "trainctl.controllers"
 
 
 @dataclass(frozen=True)
@@ -156,88 +150,6 @@ class Prepared:
         out = np.empty(4)
         leader_at(self.reference, t, t, out)
         return out
-
-
-def laws() -> list[str]:
-    """Names of the laws that come with the package and of those other packages offer."""
-    own = [m.name for m in pkgutil.iter_modules(controllers.__path__) if hasattr(_module(controllers, m.name), "CLOCK")]
-    return sorted({*own, *(e.name for e in importlib.metadata.entry_points(group=ENTRY_POINTS))})
-
-
-def _module(package: Any, name: str) -> Any:
-    return importlib.import_module(f"{package.__name__}.{name}")
-
-
-def find_law(name: str, folder: Path = Path()) -> Any:
-    """The module of a law: one of ours, an entry point of another package, or a file.
-
-    Parameters
-    ----------
-    name : str
-        Name, or the path of a file ending in .py.
-    folder : Path
-        Where a relative path starts; if there is no such file, it starts in the current directory.
-
-    Raises
-    ------
-    InputError
-        No such law, it cannot be imported, or it lacks something a law must have.
-    """
-    if name.endswith(".py"):
-        file = folder / name if (folder / name).is_file() else Path(name)
-        if not file.is_file():
-            raise InputError(f"controller.law = {name}: no such file")
-        return _complete(name, partial(_law_file, file))
-    if name.isidentifier() and any(m.name == name for m in pkgutil.iter_modules(controllers.__path__)):
-        module = _module(controllers, name)
-        if hasattr(module, "CLOCK"):
-            return module
-    for entry in importlib.metadata.entry_points(group=ENTRY_POINTS, name=name):
-        return _complete(name, entry.load)
-    raise InputError(f"controller.law = {name}: no such law; known: {', '.join(laws())}")
-
-
-def _law_file(file: Path) -> Any:
-    """A law's file as a module, read anew each time."""
-    name = f"trainctl_law_{file.stem}"
-    spec = importlib.util.spec_from_file_location(name, file.resolve())
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # pydantic looks annotations up there
-    spec.loader.exec_module(module)
-    return module
-
-
-#: What a module must have to be a law, by its clock.
-PARTS = {
-    "sampled": ("Params", "violations", "constants", "message", "demand"),
-    "continuous": ("ORDER", "MESSAGE", "WATCHED", "Params", "violations", "constants", "message", "demand", "watch"),
-}
-
-
-def _complete(name: str, load: Any) -> Any:
-    """Somebody else's law, if it can be imported and has all its parts."""
-    try:
-        module = load()
-    except Exception as error:  # whatever somebody else's module raises
-        lines = traceback.extract_tb(error.__traceback__)
-        where = f" (line {error.lineno})" if isinstance(error, SyntaxError) else f" ({lines[-1].name}, line {lines[-1].lineno})"
-        raise InputError(f"controller.law = {name}: cannot be imported: {type(error).__name__}: {error}{where}") from None
-    clock = getattr(module, "CLOCK", None)
-    if clock not in PARTS:
-        raise InputError(f'controller.law = {name}: CLOCK = {clock!r}: must be "sampled" or "continuous"')
-    missing = [part for part in PARTS[clock] if not hasattr(module, part)]
-    if missing:
-        raise InputError(f"controller.law = {name}: a {clock} law needs {', '.join(missing)}")
-    return module
-
-
-def find_observer(name: str) -> Any:
-    """The module of an observer."""
-    known = [m.name for m in pkgutil.iter_modules(observers.__path__)]
-    if name not in known:
-        raise InputError(f"observer.kind = {name}: no such observer; known: {', '.join(known)}")
-    return _module(observers, name)
 
 
 def open_scenario(name: str, overrides: dict[str, Any] | None = None) -> Prepared:

@@ -8,7 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 from trainctl.cli import app
-from trainctl.prepare import laws, prepare
+from trainctl.laws import laws
+from trainctl.prepare import prepare
 from trainctl.reading import examine, find, read
 from trainctl.record import compare
 from trainctl.record.compare import PANELS, alternatives, figures, names, table

@@ -6,14 +6,19 @@ import json
 import os
 import subprocess
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
 import trainctl
+from trainctl import laws
+from trainctl.controllers import emu_finite_time
 from trainctl.errors import InputError
+from trainctl.laws import find_law
 from trainctl.new import controller
-from trainctl.prepare import find_law, open_scenario
+from trainctl.plants.integrate import described, part
+from trainctl.prepare import open_scenario
 
 BIN = Path(sys.executable).parent / "trainctl"
 
@@ -108,3 +113,22 @@ def test_a_file_that_is_no_law_is_one_line(text, says, tmp_path):
     assert says in caught.value.mistakes[0]
     with pytest.raises(InputError, match="no such file"):
         find_law("missing.py", tmp_path)
+
+
+def test_a_law_offered_by_a_package_must_be_a_module(monkeypatch):
+    offered = EntryPoint("odd", "types:SimpleNamespace", "trainctl.controllers")
+    monkeypatch.setattr(laws.importlib.metadata, "entry_points", lambda **_: [offered])
+    with pytest.raises(InputError, match=r"controller.law = odd: is a type: a law must be a module"):
+        find_law("odd")
+
+
+def test_a_changed_law_is_another_module(tmp_path):
+    """Kernels are cached by the module's name: an old one must not serve a law that was edited."""
+    (tmp_path / "mine.py").write_text(Path(emu_finite_time.__file__).read_text())
+    before = find_law("mine.py", tmp_path)
+    (tmp_path / "mine.py").write_text(Path(emu_finite_time.__file__).read_text() + "\n")
+    after = find_law("mine.py", tmp_path)
+    assert before.__name__ != after.__name__
+    assert described(before) != described(after)
+    assert part(described(before), 0, "demand") is before.demand
+    assert part(described(after), 0, "demand") is after.demand

@@ -36,7 +36,7 @@ from numba import njit
 from pydantic import Field
 
 from trainctl.controllers.powers import BLOCK, signed_powers
-from trainctl.kernels import bare
+from trainctl.kernels import inlined
 from trainctl.signals import POSITION, SPEED, Floats, Ints, Links, Scene, Table, leader_at
 
 CLOCK: Literal["continuous"] = "continuous"
@@ -126,7 +126,7 @@ def constants(params: Params, scene: Scene) -> Constants:
     )  # fmt: skip
 
 
-@bare(error_model="numpy")
+@inlined()
 def coupler_weight(e: float, h1: float, h2: float, delta1: float, delta2: float) -> float:
     """Barrier weight w of a coupler at stretch ``e``: 1 inside, unbounded towards h1 and -h2."""
     if e > h1 - delta1:
@@ -138,7 +138,7 @@ def coupler_weight(e: float, h1: float, h2: float, delta1: float, delta2: float)
     return 1.0
 
 
-@bare(error_model="numpy")
+@inlined()
 def train_weight(z: float, ls: float, le: float, beta: float, gamma1: float, gamma2: float) -> float:
     """Weight b between trains at clear distance ls + ``z``: 0 out of range, unbounded towards the emergency distance."""
     zeta, beta_hat = ls - le, beta - ls
@@ -152,7 +152,7 @@ def train_weight(z: float, ls: float, le: float, beta: float, gamma1: float, gam
     return 1.0
 
 
-@bare(error_model="numpy")
+@inlined()
 def demand(
     i: int, constants: Constants, leader: Floats, age: float, slot: float, own: Floats, estimate: Floats, correction: Floats,
     desired: Floats, heard: Floats, out: Floats,
@@ -232,7 +232,7 @@ def demand(
     out[last] += units[start + last, INERTIA] * a_tail
 
 
-@bare(error_model="numpy")
+@inlined()
 def message(
     i: int, constants: Constants, leader: Floats, slot: float, own: Floats, estimate: Floats, estimate_rate: Floats, out: Floats
 ) -> None:
@@ -248,7 +248,7 @@ def message(
     out[LENGTH_OF_TRAIN] = ahead + constants.units[start + last, LENGTH]
 
 
-@bare(error_model="numpy")
+@inlined()
 def watch(i: int, constants: Constants, leader: Floats, first: Ints, own: Floats, links: Links, out: Floats) -> None:
     """Write the clear distance to the train ahead [m], eq. (9), into ``out`` (1,): NaN if train ``i`` hears none."""
     out[0] = np.nan

@@ -40,13 +40,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
-from numba import njit
 from pydantic import Field
 
+from trainctl.kernels import inlined
 from trainctl.signals import POSITION, SPEED, Floats, Ints, Links, Scene, Table, leader_at
 
 CLOCK: Literal["continuous"] = "continuous"
@@ -61,9 +60,6 @@ PLANTS = ("actuated_units",)
 OBSERVERS = ("asymptotic", "intermediate")
 X, V, W = 0, 1, 2
 X_RATE, V_RATE, W_DRIFT, UNCOMPENSATED, STATIC = 0, 1, 2, 3, 4
-
-#: ``njit`` as the integrator's: division as in numpy, no reference counts.
-compiled: Any = partial(njit, cache=True, error_model="numpy", _nrt=False)
 
 #: The jerk of an old message fades with this time [s], about that of beta2. Carried on unchanged it grows for a whole
 #: communication period, and at 1 s the loop is lost; dropped at once it costs higher peaks of force.
@@ -151,7 +147,7 @@ def resolved(params: Params, lower: float, upper: float, step: float) -> tuple[f
     return kept[0], kept[1]
 
 
-@compiled()
+@inlined()
 def ahead(desired: Floats) -> int:
     """Row of the nearest train ahead among the links of one train, -1 if it hears none from ahead."""
     best = -1
@@ -161,7 +157,7 @@ def ahead(desired: Floats) -> int:
     return best
 
 
-@compiled()
+@inlined()
 def barrier(e: float, bounds: Floats) -> tuple[float, float]:
     """Product phi Phi of eqs. (34), (35) at ``e`` and its derivative, for one row of ``distance`` or ``mixed`` (4,)."""
     lower, upper = bounds[0], bounds[1]
@@ -173,7 +169,7 @@ def barrier(e: float, bounds: Floats) -> tuple[float, float]:
     return log * both + slope * (e - at), slope
 
 
-@compiled()
+@inlined()
 def demand(
     i: int, constants: Constants, leader: Floats, age: float, slot: float, own: Floats, estimate: Floats, correction: Floats,
     desired: Floats, heard: Floats, out: Floats,
@@ -224,7 +220,7 @@ def demand(
         w_rate += correction[j, UNCOMPENSATED]  # hat w' of (13) with this u
 
 
-@compiled()
+@inlined()
 def message(
     i: int, constants: Constants, leader: Floats, slot: float, own: Floats, estimate: Floats, estimate_rate: Floats, out: Floats
 ) -> None:
@@ -236,7 +232,7 @@ def message(
     out[3] = estimate_rate[tail, W] - leader[3]
 
 
-@compiled()
+@inlined()
 def watch(i: int, constants: Constants, leader: Floats, first: Ints, own: Floats, links: Links, out: Floats) -> None:
     """Write xt, vt, qt of train ``i`` (3,)."""
     head, rows = first[i], slice(links.first[i], links.first[i + 1])

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from trainctl.kernels import bare
+from trainctl.kernels import inlined
 from trainctl.signals import Floats
 
 #: As many numbers as one pass of the compiled loop takes, or two; what is left over is slow.
@@ -33,7 +33,7 @@ L0, L1, L2, L3, L4, L5, L6, L7, L8, L9 = (2.0 / (math.log(2.0) * (2 * k + 1)) fo
 E0, E1, E2, E3, E4, E5, E6, E7, E8, E9, E10, E11, E12, E13 = (math.log(2.0) ** k / math.factorial(k) for k in range(14))
 
 
-@bare(error_model="numpy")
+@inlined()
 def signed_powers(x: Floats, alpha: float, out: Floats) -> None:
     """Write sign(x) |x|**alpha into ``out``, good to 5e-16 of itself.
 

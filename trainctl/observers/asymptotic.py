@@ -31,13 +31,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from numba import njit
 from pydantic import Field
 
+from trainctl.kernels import inlined
 from trainctl.signals import POSITION, SPEED, Consists, Floats, Ints, Scene, Table
 
 WIDTH = 6  # with one sinusoid; see width()
@@ -66,9 +65,6 @@ class Params(Table):
 
 #: Columns of ``Train.units``. FRONT and REAR are B2 and B3 of eq. (4), b / m of the couplers before and behind [1/s].
 LENGTH, MASS, C0, C1, C2, STIFFNESS, DAMPING, RATE, FRONT, REAR = range(10)
-
-#: ``njit`` as the integrator's: division as in numpy, no reference counts.
-compiled: Any = partial(njit, cache=True, error_model="numpy", _nrt=False)
 
 
 class Train(NamedTuple):
@@ -210,7 +206,7 @@ def initial(params: Params, own: Floats) -> Floats:
     return estimate
 
 
-@compiled()
+@inlined()
 def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out: Floats) -> None:
     """Right-hand sides of (13) with the corrections (14), without the input; then the force of (5) at u = 0."""
     c, m = constants, constants.train
@@ -242,7 +238,7 @@ def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out:
     static_force(i, m, own, out)
 
 
-@compiled()
+@inlined()
 def rate(i: int, constants: Constants, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats) -> None:
     """d(estimate)/dt of (13); the input is what was applied after the limits."""
     c, m = constants, constants.train
@@ -266,14 +262,14 @@ def fault_estimate(constants: Constants, estimate: Floats) -> Floats:
     return total
 
 
-@compiled(inline="always")
+@inlined(inline="always")
 def own_coefficient(unit: Floats, v: float) -> float:
     """B1 of eq. (4): how the acceleration of a unit damps itself at this speed [1/s]."""
     B1: float = -(unit[FRONT] + unit[REAR] + unit[C1] + 2.0 * unit[C2] * abs(v) + unit[RATE])
     return B1
 
 
-@compiled()
+@inlined()
 def static_force(i: int, train: Train, own: Floats, out: Floats) -> None:
     """Write the demand (5) at u = 0 as a force, B + m R - m B4 / r [N], into the column STATIC of ``out``."""
     first, last = train.first[i], len(own) - 1

@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
+from trainctl.kernels import inlined
 from trainctl.observers.asymptotic import (
     FRONT,
     MASS,
@@ -39,7 +40,6 @@ from trainctl.observers.asymptotic import (
     V,
     W,
     X,
-    compiled,
     own_coefficient,
     static_force,
     train_of,
@@ -112,7 +112,7 @@ def initial(params: Params, own: Floats) -> Floats:
     return estimate
 
 
-@compiled()
+@inlined()
 def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out: Floats) -> None:
     """Write right-hand sides without the input, as ``asymptotic.correction`` does: mu1 = -3 e_x, mu2 = -L1 e_v, mu3 = -L2 e_v."""
     c, m = constants, constants.train
@@ -132,7 +132,7 @@ def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out:
     static_force(i, m, own, out)
 
 
-@compiled()
+@inlined()
 def rate(i: int, constants: Constants, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats) -> None:
     """d(estimate)/dt; the input is what was applied after the limits."""
     c, m = constants, constants.train

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from trainctl.kernels import inlined
 from trainctl.signals import Floats, Scene, Table
 
 CORRECTIONS = 0
@@ -42,11 +42,11 @@ def initial(params: Params, own: Floats) -> Floats:
     return np.zeros((len(own), 0))
 
 
-@njit(cache=True)
+@inlined()
 def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out: Floats) -> None:
     """Nothing to correct."""
 
 
-@njit(cache=True)
+@inlined()
 def rate(i: int, constants: Constants, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats) -> None:
     """Nothing to estimate."""

@@ -30,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from trainctl.kernels import bare
+from trainctl.kernels import inlined
 from trainctl.plants import coupled_units
 from trainctl.plants.coupled_units import (
     BRAKING,
@@ -167,7 +167,7 @@ def balanced(own: Floats, consists: Consists, gradient: Floats | None = None) ->
     return state
 
 
-@bare(error_model="numpy")
+@inlined()
 def limit(i: int, constants: Constants, own: Floats, applied: Floats) -> bool:
     """Clip the demanded forces to effort and power of each unit, in place; True if one acted."""
     acted = False
@@ -184,7 +184,7 @@ def limit(i: int, constants: Constants, own: Floats, applied: Floats) -> bool:
     return acted
 
 
-@bare(error_model="numpy")
+@inlined()
 def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, applied: Floats, out: Floats, power: Floats) -> None:
     """d(own)/dt, eqs. (1), (2), and the train's powers [W]: see ``signals.Plant``.
 

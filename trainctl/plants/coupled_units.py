@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from trainctl.kernels import bare
+from trainctl.kernels import inlined
 from trainctl.signals import GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Table
 
 STATES = 2
@@ -88,13 +88,13 @@ def constants(
     return Constants(consists.first, np.ascontiguousarray(units, dtype=np.float64), slopes)
 
 
-@bare(error_model="numpy", inline="always")
+@inlined(inline="always")
 def running_resistance(v: float, c0: float, c1: float, c2: float) -> float:
     """Specific running resistance [N/kg], Davis form: eq. (3), but zero at standstill."""
     return c0 + (c1 + c2 * v) * v if v > 0.0 else 0.0
 
 
-@bare(error_model="numpy")
+@inlined()
 def slope_at(x: float, gradient: Floats) -> float:
     """Rise / run at position ``x``."""
     if len(gradient) == 0:
@@ -109,13 +109,13 @@ def slope_at(x: float, gradient: Floats) -> float:
     return gradient[low, 1]  # type: ignore[no-any-return]
 
 
-@bare(error_model="numpy", inline="always")
+@inlined(inline="always")
 def available(v: float, force: float, power: float) -> float:
     """Largest force at speed ``v`` [N] of a unit limited by ``force`` [N] and ``power`` [W]."""
     return power / v if v > 0.0 and v * force > power else force
 
 
-@bare(error_model="numpy")
+@inlined()
 def limit(i: int, constants: Constants, own: Floats, applied: Floats) -> bool:
     """Clip the forces of train ``i`` to force and power limits of its units, in place; True if one acted."""
     a = constants.first[i]
@@ -134,7 +134,7 @@ def limit(i: int, constants: Constants, own: Floats, applied: Floats) -> bool:
     return acted
 
 
-@bare(error_model="numpy")
+@inlined()
 def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, applied: Floats, out: Floats, power: Floats) -> None:
     """Write speed and acceleration of every unit of train ``i`` into ``out``, the train's powers into ``power``: eqs. (1)-(4).
 

@@ -14,7 +14,7 @@ from typing import Annotated, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from trainctl.kernels import bare
+from trainctl.kernels import inlined
 from trainctl.signals import Consists, Floats, Ints, Table
 
 #: Keys each kind needs besides its place and window.
@@ -121,7 +121,7 @@ def tabulated(faults: Sequence[Fault], trains: Sequence[str], consists: Consists
     return Faults(*stacked(rate, 5), *stacked(loss, 3))
 
 
-@bare(error_model="numpy")
+@inlined()
 def fault_rate(faults: Faults, u: int, t: float, inside: float) -> float:
     """E f of unit ``u`` at ``t`` [N/s]; windows are open or shut as at ``inside``."""
     total = 0.0
@@ -134,7 +134,7 @@ def fault_rate(faults: Faults, u: int, t: float, inside: float) -> float:
     return total
 
 
-@bare(error_model="numpy")
+@inlined()
 def effectiveness(faults: Faults, u: int, inside: float) -> float:
     """Share of its demanded force that the actuator of unit ``u`` gives."""
     share = 1.0

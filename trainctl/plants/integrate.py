@@ -8,31 +8,34 @@ What is compiled here neither allocates nor counts references: counting alone to
 
 from __future__ import annotations
 
-import warnings
+import hashlib
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-from numba.core import cgutils as untyped_cgutils
-from numba.extending import intrinsic, overload
+from numba.extending import overload
 
 from trainctl.kernels import bare
 from trainctl.signals import FORCE, POWERS, Floats, Ints, Links, Reference, leader_at
 
 types: Any = numba.types
 typeof: Any = numba.typeof
-cgutils: Any = untyped_cgutils
 config: Any = numba.config
+
+#: Whose function ``part`` finds.
+LAW, OBSERVER, PLANT = range(3)
 
 #: Trains integrated together where they do not hear each other: few enough for the second cache, enough to share the calls.
 TOGETHER = 64
 
 
 class Parts(NamedTuple):
-    """The closed loop's functions, compiled: see ``compiled``."""
+    """The closed loop, compiled for one law, observer and plant: see ``compiled``."""
 
-    functions: Any  # addresses of the seven functions, or these themselves where nothing is compiled
+    code: str  # whose functions: see ``described``
     advance: Callable[..., None]
     exchange: Callable[..., None]
 
@@ -144,13 +147,15 @@ def add(lift, sign, a, b, applied):  # type: ignore[no-untyped-def]
 
 
 @bare()
-def stage(parts, loop, first, links, reference, air, t, inside, own, estimate, work, low, high):  # type: ignore[no-untyped-def]
+def stage(code, loop, first, links, reference, air, t, inside, own, estimate, work, low, high):  # type: ignore[no-untyped-def]
     """Evaluate the closed loop of trains ``low`` to ``high`` at one instant: fills ``work`` with forces and rates.
 
     The weight along the track is known and made up for: it is added to what the law demands, within the limits. Observers, which
     know of no slopes, see the rest.
     """
-    demand, message, _, correction, estimate_rate, limit, rate = parts
+    demand, message = part(code, LAW, "demand"), part(code, LAW, "message")
+    correction, estimate_rate = part(code, OBSERVER, "correction"), part(code, OBSERVER, "rate")
+    limit, rate = part(code, PLANT, "limit"), part(code, PLANT, "rate")
     observed = estimate.shape[1] > 0
     leader_at(reference, t, inside, work.leader)
     age = 0.0 if air.live else t - air.sent_at
@@ -195,11 +200,10 @@ def stage(parts, loop, first, links, reference, air, t, inside, own, estimate, w
 
 
 @bare()
-def exchange_kernel(functions, loop, first, links, reference, air, t, own, estimate, work):  # type: ignore[no-untyped-def]
+def exchange_kernel(code, loop, first, links, reference, air, t, own, estimate, work):  # type: ignore[no-untyped-def]
     """See ``exchange``."""
-    parts = closed_loop(functions, loop, first, links)
-    message = parts[1]
-    stage(parts, loop, first, links, reference, air, t, t, own, estimate, work, 0, len(first) - 1)
+    message = part(code, LAW, "message")
+    stage(code, loop, first, links, reference, air, t, t, own, estimate, work, 0, len(first) - 1)
     for i in range(len(first) - 1):
         a, b = first[i], first[i + 1]
         if len(loop.orders.pace) > 0:
@@ -208,9 +212,9 @@ def exchange_kernel(functions, loop, first, links, reference, air, t, own, estim
 
 
 @bare()
-def see(parts, loop, first, length, links, t, own, work, extremes, low, high):  # type: ignore[no-untyped-def]
+def see(code, loop, first, length, links, t, own, work, extremes, low, high):  # type: ignore[no-untyped-def]
     """Widen ``extremes`` of trains ``low`` to ``high`` by the state and the forces of this instant; what is NaN widens nothing."""
-    watch = parts[2]
+    watch = part(code, LAW, "watch")
     for i in range(low, high):
         a, b = first[i], first[i + 1]
         for u in range(a, b):
@@ -258,20 +262,19 @@ def talking(air):  # type: ignore[no-untyped-def]
 
 
 @bare()
-def advance_kernel(functions, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes):  # type: ignore[no-untyped-def]
+def advance_kernel(code, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes):  # type: ignore[no-untyped-def]
     """See ``advance``. Trains that do not hear each other meanwhile are taken a few at a time, so that they stay in the cache."""
-    parts = closed_loop(functions, loop, first, links)
     trains = len(first) - 1
     size = trains if talking(air) else TOGETHER
     for low in range(0, trains, max(size, 1)):
         stretch(
-            parts, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes, low,
+            code, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes, low,
             min(low + size, trains),
         )  # fmt: skip
 
 
 @bare()
-def stretch(parts, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes, low, high):  # type: ignore[no-untyped-def]
+def stretch(code, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes, low, high):  # type: ignore[no-untyped-def]
     """Integrate trains ``low`` to ``high``."""
     a, b = first[low], first[high]
     x, q, energy, power = own[a:b], estimate[a:b], extremes.energy[low:high], work.power[low:high]
@@ -293,9 +296,9 @@ def stretch(parts, loop, first, length, links, reference, air, t, h, n, breaks, 
                 if s > 0:
                     along(x, x_0, ahead, x_rate)
                     along(q, q_0, ahead, q_rate)
-                stage(parts, loop, first, links, reference, air, begin + ahead, begin + 0.5 * dt, own, estimate, work, low, high)
+                stage(code, loop, first, links, reference, air, begin + ahead, begin + 0.5 * dt, own, estimate, work, low, high)
                 if s == 0:
-                    see(parts, loop, first, length, links, begin, own, work, extremes, low, high)
+                    see(code, loop, first, length, links, begin, own, work, extremes, low, high)
                     for i in range(low, high):
                         extremes.limited[i] += dt * work.limited[i]
                     if k == 0 and begin == t:
@@ -312,79 +315,46 @@ def stretch(parts, loop, first, length, links, reference, air, t, h, n, breaks, 
             begin = stop
 
 
-def signatures(loop: Any, first: Any, links: Any) -> tuple[Any, ...]:
-    """Types of the seven functions for these types of ``Loop``, ``first`` and ``Links``, in the order of ``Parts.functions``."""
-    whole, real, row, table = types.int64, types.float64, types.float64[::1], types.float64[:, ::1]
-    law, observer, plant, *_ = loop
-    return (
-        types.void(whole, law, row, real, real, table, table, table, row, table, row),
-        types.void(whole, law, row, real, table, table, table, row),
-        types.void(whole, law, row, first, table, links, row),
-        types.void(whole, observer, table, table, table),
-        types.void(whole, observer, table, table, table, row, table),
-        types.boolean(whole, plant, table, row),
-        types.void(whole, plant, real, real, table, row, table, row),
-    )
+def part(code: str, owner: int, name: str) -> Any:
+    """Find the function ``name`` of the law (``owner`` 0), the observer (1) or the plant (2) that ``code`` describes.
 
-
-@intrinsic
-def from_addresses(typingctx, functions, loop, first, links):  # type: ignore[no-untyped-def]
-    """Make functions to call of the addresses of compiled ones.
-
-    Handed over as Python objects, numba would look each of them up again at every call from Python: 0.3 ms.
+    In compiled code the choice is made while compiling: the functions are inlined into the stage. Handed over as arguments
+    they would have their own arguments, hundreds of words, copied for each train and stage; that took a third of the time.
     """
-    members = types.Tuple([types.FunctionType(s) for s in signatures(loop, first, links)])
-
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        addresses = context.make_array(functions)(context, builder, args[0])
-        pointer = context.get_value_type(types.voidptr)
-        values = []
-        for k, member in enumerate(members):
-            value = cgutils.create_struct_proxy(member)(context, builder)
-            value.c_addr = value.py_addr = cgutils.get_null_value(pointer)
-            address = builder.load(cgutils.gep(builder, addresses.data, k))
-            value.jit_addr = builder.inttoptr(address, pointer)
-            values.append(value._getvalue())
-        return context.make_tuple(builder, members, values)
-
-    return members(functions, loop, first, links), codegen
+    return getattr(sys.modules[code.split()[owner]], name)
 
 
-def closed_loop(functions: Any, loop: Any, first: Any, links: Any) -> Any:
-    """Make the seven functions of ``Parts.functions`` ready to be called."""
-    return functions
+@overload(part, prefer_literal=True)
+def part_compiled(code, owner, name):  # type: ignore[no-untyped-def]
+    """Say what ``part`` is in compiled code."""
+    function = part(*(argument.literal_value for argument in (code, owner, name)))
+    return lambda code, owner, name: function
 
 
-@overload(closed_loop)
-def closed_loop_of_addresses(functions, loop, first, links):  # type: ignore[no-untyped-def]
-    """Say what ``closed_loop`` is in compiled code."""
-    return lambda functions, loop, first, links: from_addresses(functions, loop, first, links)  # type: ignore[call-arg]
+def described(*modules: Any) -> str:
+    """Names of these modules, then digests of their files: kernels are compiled for, and cached by, this text."""
+    digests = (hashlib.sha256(Path(module.__file__).read_bytes()).hexdigest()[:16] for module in modules)
+    return " ".join([*(module.__name__ for module in modules), *digests])
 
 
 def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...]) -> Parts:
     """Make the functions of the closed loop ready for ``arguments``, those of ``advance`` after ``parts``.
 
     They serve as long as the types of the arguments stay: new values, links and constants of the same shape of data need no
-    new call. Compiled code is cached on disk between processes, each module's own.
+    new call. Compiled code is cached on disk between processes.
     """
-    functions = (law.demand, law.message, law.watch, observer.correction, observer.rate, plant.limit, plant.rate)
+    code = described(law, observer, plant)
     if config.DISABLE_JIT:
-        return Parts(functions, advance_kernel, exchange_kernel)
+        return Parts(code, advance_kernel, exchange_kernel)
     loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes = (typeof(a) for a in arguments)
-    addresses = np.empty(len(functions), dtype=np.int64)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", numba.NumbaExperimentalFeatureWarning)  # function types: tested here, kept
-        for k, (function, signature) in enumerate(zip(functions, signatures(loop, first, links), strict=True)):
-            from_cache(function, signature.args)
-            code = function.overloads[signature.args]
-            addresses[k] = code.library.get_pointer_to_function(code.fndesc.llvm_func_name)
-        table = typeof(addresses)
-        advance_ = from_cache(
-            advance_kernel,
-            (table, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes),
-        )
-        exchange_ = from_cache(exchange_kernel, (table, loop, first, links, reference, air, t, own, estimate, work))
-    return Parts(addresses, advance_, exchange_)
+    text = types.literal(code)
+    return Parts(
+        code,
+        from_cache(
+            advance_kernel, (text, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes)
+        ),
+        from_cache(exchange_kernel, (text, loop, first, links, reference, air, t, own, estimate, work)),
+    )
 
 
 #: Whose caches on disk name the types of laws, observers and plants.
@@ -413,7 +383,7 @@ def advance(
     The arguments must be of the types ``compiled`` was given (a float stays a float): nothing is checked here, since numba's own
     check of so many arguments takes 0.4 ms.
     """
-    parts.advance(parts.functions, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes)
+    parts.advance(parts.code, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes)
     return work.applied_first.copy()
 
 
@@ -422,4 +392,4 @@ def exchange(
     work: Scratch,
 ) -> None:  # fmt: skip
     """Fill ``work.sent`` with what every train sends at ``t``, each from what it had heard until then."""
-    parts.exchange(parts.functions, loop, first, links, reference, air, t, own, estimate, work)
+    parts.exchange(parts.code, loop, first, links, reference, air, t, own, estimate, work)

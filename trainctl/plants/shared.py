@@ -20,7 +20,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from trainctl.kernels import bare
+from trainctl.kernels import inlined
 from trainctl.plants import coupled_units
 from trainctl.plants.coupled_units import (
     BRAKING,
@@ -64,7 +64,7 @@ def constants(params: coupled_units.Params, consists: Consists, gradient: Floats
     return Constants(first, units, slopes, held, params.in_train_stiffness_per_s2, params.in_train_damping_per_s)
 
 
-@bare(error_model="numpy")
+@inlined()
 def demand(
     i: int, constants: Constants, leader: Floats, age: float, slot: float, own: Floats, estimate: Floats, correction: Floats,
     desired: Floats, heard: Floats, out: Floats,
@@ -104,7 +104,7 @@ def demand(
             out[j + 1] -= f
 
 
-@bare(error_model="numpy", inline="always")
+@inlined(inline="always")
 def pair(constants: Constants, row: int, own: Floats, j: int) -> float:
     """Force [N] the active part of the coupler behind unit ``j`` pulls its two units together with."""
     e = own[j, POSITION] - own[j + 1, POSITION] - constants.units[row, LENGTH]
@@ -113,14 +113,14 @@ def pair(constants: Constants, row: int, own: Floats, j: int) -> float:
     return float(lighter * (constants.stiffness * e + constants.damping * de))
 
 
-@bare(error_model="numpy")
+@inlined()
 def message(
     i: int, constants: Constants, leader: Floats, slot: float, own: Floats, estimate: Floats, estimate_rate: Floats, out: Floats
 ) -> None:
     """Nothing to send: trains talk in the sampled law."""
 
 
-@bare(error_model="numpy")
+@inlined()
 def watch(i: int, constants: Constants, leader: Floats, first: Ints, own: Floats, links: Links, out: Floats) -> None:
     """Nothing to watch here."""
 

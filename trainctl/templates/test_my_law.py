@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import trainctl
-from trainctl.prepare import find_law
+from trainctl.laws import find_law
 from trainctl.testing_laws import CHECKS, Example
 
 HERE = Path(__file__).parent
