@@ -1,8 +1,9 @@
 """What closing the loop costs beside SUMO alone: one command, one run, side by side.
 
 ``python tools/bench.py`` prints a table, ``--json`` a list of rows; ``--trains 1000`` keeps to one size. Every case is a process
-of its own, since libsumo holds one simulation per process; the cases take turns, so that a busy machine slows all of them alike,
-and the median of the repeats is told.
+of its own, since libsumo holds one simulation per process. These processes run at the same time, but only one of them at work: they
+take turns every few steps, so that a busy machine, whose speed changes from second to second, slows all of them alike. The whole is
+repeated with new processes, and medians are told: of times, and of ratios within a repeat.
 
 =================  ===============================================================================================================
 bare               SUMO stepping the trains, each at the constant commanded speed it starts with
@@ -32,16 +33,16 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 SIZES = (10, 100, 1000, 10_000)
 IN_SUMO = ("bare", "rail", "loop", "traci", "client")
 ALONE = ("bare", "rail", "client")  # without our loop
 NUMERIC = ("coupled_units", "finite_time", "actuated_units")
-#: Compared to a few per cent; through TraCI everything is many times slower, which one turn tells.
+#: Compared to a few per cent; through TraCI everything is many times slower, which one repeat tells.
 REPEATED = ("bare", "rail", "loop")
 PARTS = ("read", "topology", "control", "plant", "write", "step", "record")
 SPEED_MPS = 80.0
@@ -50,6 +51,9 @@ SPACING_M = dict.fromkeys((*IN_SUMO, *NUMERIC), 500.0) | {"finite_time": 900.0, 
 #: Train-steps of one repeat, about; the slower a case, the fewer.
 WORK = {"traci": 15_000, "client": 10_000, "coupled_units": 15_000, "finite_time": 15_000, "actuated_units": 9_000}
 IN_SUMO_WORK = 120_000
+
+#: Turns the cases take within a repeat: at 1000 trains, some 30 ms of each.
+SLICES = 20
 
 
 def steps_of(case: str, trains: int) -> int:
@@ -240,27 +244,38 @@ def inputs(folder: Path, case: str, trains: int, steps: int) -> None:
         routes.write_text(text.replace(own, 'minGap="0" sigma="0" carFollowModel="Rail" trainType="ICE3"'), encoding="utf-8")
 
 
-def alone(folder: Path, case: str, steps: int) -> dict[str, Any]:
+class Case(NamedTuple):
+    """What is measured."""
+
+    trains: int
+    step: Callable[[], Any]
+    close: Callable[[], Any]
+    clock: Clock
+
+
+def alone(folder: Path, case: str) -> Case:
     """SUMO without a loop: bare or rail."""
     import libsumo
 
     libsumo.start(json.loads((folder / "command.json").read_text(encoding="utf-8")))
     libsumo.simulationStep()
-    names = libsumo.vehicle.getIDList()
+    names, clock = libsumo.vehicle.getIDList(), Clock()
     if case == "bare":
         for name in names:
             libsumo.vehicle.setSpeedMode(name, 32)
             libsumo.vehicle.setLaneChangeMode(name, 0)
             libsumo.vehicle.setSpeed(name, libsumo.vehicle.getSpeed(name))
-    began, busy = time.perf_counter(), time.process_time()
-    for _ in range(steps):
-        libsumo.simulationStep()
-    libsumo.close()
-    spent, cpu = time.perf_counter() - began, time.process_time() - busy
-    return {"trains": len(names), "seconds": [spent], "cpu": [cpu], "parts": {"step": spent}, "peak_mb": peak_mb()}
+    clock.around(libsumo, "close", "step")
+    step = libsumo.simulationStep  # without the clock: what is compared with must not pay for it
+
+    def timed() -> None:
+        with clock.part("step"):
+            step()
+
+    return Case(len(names), timed, libsumo.close, clock)
 
 
-def client(folder: Path, steps: int) -> dict[str, Any]:
+def client(folder: Path) -> Case:
     """A loop around SUMO through TraCI that asks for and commands one train after the other."""
     api = through_traci()
     api.start(json.loads((folder / "command.json").read_text(encoding="utf-8")))
@@ -268,8 +283,8 @@ def client(folder: Path, steps: int) -> dict[str, Any]:
     vehicle, names, clock = api.vehicle, api.vehicle.getIDList(), Clock()
     for name in names:
         vehicle.setSpeedMode(name, 32)
-    began, busy = time.perf_counter(), time.process_time()
-    for _ in range(steps):
+
+    def step() -> None:
         with clock.part("read"):
             seen = {name: (vehicle.getRoadID(name), vehicle.getLanePosition(name), vehicle.getSpeed(name)) for name in names}
         with clock.part("write"):
@@ -277,13 +292,12 @@ def client(folder: Path, steps: int) -> dict[str, Any]:
                 vehicle.setSpeed(name, speed)
         with clock.part("step"):
             api.simulationStep()
-    with clock.part("step"):
-        api.close()
-    spent, cpu = time.perf_counter() - began, time.process_time() - busy + sum(os.times()[2:4])
-    return {"trains": len(names), "seconds": [spent], "cpu": [cpu], "parts": clock.spent, "peak_mb": peak_mb()}
+
+    clock.around(api, "close", "step")
+    return Case(len(names), step, api.close, clock)
 
 
-def closed(folder: Path, case: str, steps: int) -> dict[str, Any]:
+def closed(folder: Path, case: str) -> Case:
     """Our loop: in SUMO, through TraCI, or numeric."""
     if case == "traci":
         sys.modules["libsumo"] = through_traci()
@@ -309,32 +323,19 @@ def closed(folder: Path, case: str, steps: int) -> dict[str, Any]:
     clock.around(simulation, "_check", "plant")
     clock.around(simulation, "_record", "record")
     clock.around(world, "move", "write")
+    clock.around(world, "close", "step")
+    clock.around(journal, "close", "record")
     if case in IN_SUMO:
         import libsumo
 
         clock.around(world, "_read", "read")
         clock.around(libsumo, "simulationStep", "step")
-    repeats = 1 if case in IN_SUMO else 3
-    seconds, cpu = [], []
-    for _ in range(repeats):
-        began, busy = time.perf_counter(), time.process_time()
-        for _ in range(max(1, steps // repeats)):
-            simulation.step()
-        seconds.append(time.perf_counter() - began)
-        cpu.append(time.process_time() - busy)
-    began, busy = time.perf_counter(), time.process_time()
-    with clock.part("step"):
+
+    def close() -> None:
         world.close()
-    with clock.part("record"):
         journal.close()
-    ended, closing = time.perf_counter() - began, time.process_time() - busy
-    closing += sum(os.times()[2:4])  # SUMO behind TraCI, from its start on
-    count = repeats * max(1, steps // repeats)
-    seconds, cpu = [repeats * s + ended for s in seconds], [repeats * s + closing for s in cpu]
-    return {
-        "trains": len(prepared.scenario.ids), "steps": count, "seconds": seconds, "cpu": cpu, "parts": clock.spent,
-        "peak_mb": peak_mb(),
-    }  # fmt: skip
+
+    return Case(len(prepared.scenario.ids), simulation.step, close, clock)
 
 
 def through_traci() -> Any:
@@ -362,25 +363,43 @@ def through_traci() -> Any:
     return shim
 
 
-def child(case: str, folder: Path, steps: int) -> None:
-    """What runs in a process of its own; prints one JSON object."""
-    if case == "client":
-        result = client(folder, steps)
-    else:
-        result = (alone if case in ALONE else closed)(folder, case, steps)
-    print(json.dumps(result))
+def child(case: str, folder: Path) -> None:
+    """What runs in a process of its own: as many steps as each line of its input says; at the end, one JSON object."""
+    running = client(folder) if case == "client" else (alone if case in ALONE else closed)(folder, case)
+    seconds = cpu = 0.0
+    print("ready", flush=True)
+    for line in sys.stdin:
+        steps = int(line)
+        began, busy = time.perf_counter(), time.process_time()
+        for _ in range(steps):
+            running.step()
+        if not steps:
+            running.close()
+        seconds += time.perf_counter() - began
+        cpu += time.process_time() - busy
+        print("done", flush=True)
+    cpu += sum(os.times()[2:4])  # SUMO behind TraCI, from its start on
+    print(json.dumps({
+        "trains": running.trains, "seconds": seconds, "cpu": cpu, "parts": running.clock.spent, "peak_mb": peak_mb(),
+    }))  # fmt: skip
 
 
 # All cases
 
 
-def python(*arguments: str) -> str:
-    """Run this file in a process of its own."""
-    command = [sys.executable, __file__, *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(f"{' '.join(arguments)} failed:\n{done.stderr}")
-    return done.stdout
+def python(*arguments: str) -> subprocess.Popen[str]:
+    """Start this file in a process of its own."""
+    pipe = subprocess.PIPE
+    return subprocess.Popen([sys.executable, __file__, *arguments], stdin=pipe, stdout=pipe, text=True)
+
+
+def told(process: subprocess.Popen[str], what: str) -> None:
+    """Wait until a process says this."""
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.strip() == what:
+            return
+    raise SystemExit(f"{process.args!r} ended before it was {what}")
 
 
 def place(root: Path, case: str, trains: int) -> Path:
@@ -392,51 +411,70 @@ def place(root: Path, case: str, trains: int) -> Path:
         (folder / "scenario.toml").write_text(text, encoding="utf-8")
         (folder / "line.toml").write_text(line, encoding="utf-8")
         if case in ALONE:
-            python("--inputs", case, str(folder), str(trains), str(steps))
+            process = python("--inputs", case, str(folder), str(trains), str(steps))
+            process.communicate()
+            if process.returncode:
+                raise SystemExit(f"{process.args!r} failed")
     for old in ("sumo", "segments"):
         shutil.rmtree(folder / old, ignore_errors=True)
     return folder
 
 
-def measure(root: Path, case: str, trains: int) -> dict[str, Any]:
-    """One repeat of one case."""
-    steps = steps_of(case, trains)
-    result: dict[str, Any] = json.loads(python("--case", case, str(place(root, case, trains)), str(steps)).splitlines()[-1])
-    return {"steps": steps, **result}
+def together(root: Path, cases: list[str], trains: int) -> dict[str, dict[str, Any]]:
+    """One repeat of these cases, which take turns every few steps."""
+    running = {case: python("--case", case, str(place(root, case, trains))) for case in cases}
+    for process in running.values():
+        told(process, "ready")
+    for slice_ in range(SLICES + 1):  # the last one closes
+        for case, process in running.items():
+            assert process.stdin is not None
+            steps = steps_of(case, trains)
+            share = steps * (slice_ + 1) // SLICES - steps * slice_ // SLICES if slice_ < SLICES else 0
+            if share or slice_ == SLICES:
+                process.stdin.write(f"{share}\n")
+                process.stdin.flush()
+                told(process, "done")
+    found = {}
+    for case, process in running.items():
+        said, _ = process.communicate()
+        found[case] = {"steps": steps_of(case, trains), **json.loads(said.splitlines()[-1])}
+    return found
 
 
 def bench(root: Path, sizes: list[int], cases: list[str], repeats: int) -> list[dict[str, Any]]:
-    """Rows of all cases at all sizes, the cases taking turns."""
+    """Rows of all cases at all sizes."""
     rows = []
     for trains in sizes:
-        found: dict[str, list[dict[str, Any]]] = {case: [] for case in cases}
+        found: list[dict[str, dict[str, Any]]] = []
         for turn in range(repeats):
-            for case in cases:
-                if turn == 0 or case in REPEATED:  # the numeric ones repeat within one process
-                    print(f"{trains} trains, {case}, {turn + 1}", file=sys.stderr)
-                    found[case].append(measure(root, case, trains))
-        rows += [row(case, trains, results) for case, results in found.items()]
-        bare = next((r["us_per_train_step"] for r in rows if r["case"] == "bare" and r["trains"] == trains), None)
-        busy = next((r["cpu_us_per_train_step"] for r in rows if r["case"] == "bare" and r["trains"] == trains), None)
-        for r in rows:
-            if r["trains"] == trains:
-                r["ratio_to_bare"] = round(r["us_per_train_step"] / bare, 3) if bare else None
-                r["cpu_ratio_to_bare"] = round(r["cpu_us_per_train_step"] / busy, 3) if busy else None
+            now = [case for case in cases if turn == 0 or case in REPEATED]
+            print(f"{trains} trains, {turn + 1} of {repeats}: {', '.join(now)}", file=sys.stderr)
+            if now:
+                found.append(together(root, now, trains))
+        rows += [row(case, trains, [results for results in found if case in results]) for case in cases]
     return rows
 
 
-def row(case: str, trains: int, results: list[dict[str, Any]]) -> dict[str, Any]:
-    """Medians of the repeats."""
-    scale = 1e6 / trains
-    times = sorted(s * scale / r["steps"] for r in results for s in r["seconds"])
+def row(case: str, trains: int, repeats: list[dict[str, dict[str, Any]]]) -> dict[str, Any]:
+    """Medians of the repeats of one case; each repeat has the results of all cases that ran."""
+
+    def each(case: str, key: str) -> list[float]:
+        return [r[case][key] * 1e6 / trains / r[case]["steps"] for r in repeats]
+
+    def to_bare(key: str) -> float | None:
+        if not all("bare" in r for r in repeats):
+            return None
+        return round(statistics.median(a / b for a, b in zip(each(case, key), each("bare", key), strict=True)), 3)
+
+    times, scale = each(case, "seconds"), 1e6 / trains / repeats[0][case]["steps"]
+    parts = {p: statistics.median(r[case]["parts"].get(p, 0.0) * scale for r in repeats) for p in PARTS}
     typical = statistics.median(times)
-    parts = {p: statistics.median(r["parts"].get(p, 0.0) * scale / r["steps"] for r in results) for p in PARTS}
     return {
-        "case": case, "trains": trains, "us_per_train_step": round(typical, 3), "ratio_to_bare": None, "cpu_ratio_to_bare": None,
-        "least_us": round(times[0], 3), "most_us": round(times[-1], 3),
-        "cpu_us_per_train_step": round(statistics.median(s * scale / r["steps"] for r in results for s in r["cpu"]), 3),
+        "case": case, "trains": trains, "us_per_train_step": round(typical, 3), "ratio_to_bare": to_bare("seconds"),
+        "cpu_ratio_to_bare": to_bare("cpu"), "least_us": round(min(times), 3), "most_us": round(max(times), 3),
+        "cpu_us_per_train_step": round(statistics.median(each(case, "cpu")), 3),
         "times_real_time": round(1e6 / (typical * trains), 1),
-        "peak_mb": round(max(r["peak_mb"] for r in results), 1),
+        "peak_mb": round(max(r[case]["peak_mb"] for r in repeats), 1),
         **{f"{part}_us": round(spent, 3) for part, spent in parts.items()},
     }  # fmt: skip
 
@@ -467,15 +505,14 @@ def main() -> None:
     parser.add_argument("--only", action="append", choices=[*IN_SUMO, *NUMERIC], help="this case; repeatable; default all")
     parser.add_argument("--repeats", type=int, default=3, help="repeats of each case; the median is told")
     parser.add_argument("--json", action="store_true", help="print a list of rows for machines")
-    parser.add_argument("--case", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--case", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--inputs", nargs=4, help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.inputs:
         case, folder, trains, steps = asked.inputs
         inputs(Path(folder), case, int(trains), int(steps))
     elif asked.case:
-        case, folder, steps = asked.case
-        child(case, Path(folder), int(steps))
+        child(asked.case[0], Path(asked.case[1]))
     else:
         with tempfile.TemporaryDirectory(prefix="trainctl-bench-") as root:
             rows = bench(Path(root), asked.trains or list(SIZES), asked.only or [*IN_SUMO, *NUMERIC], asked.repeats)

@@ -42,12 +42,17 @@ def test_time_inside_a_part_is_not_that_of_the_part_around_it(monkeypatch):
     assert (clock.spent["write"], clock.spent["step"], clock.spent["read"]) == (1001.0, 10.0, 100.0)
 
 
-def test_rows_are_medians_per_train_and_step():
-    results = [{"steps": 10, "seconds": [s], "cpu": [s], "parts": {"step": s / 2}, "peak_mb": s} for s in (3.0, 1.0, 2.0)]
-    row = bench.row("loop", 100, results)
+def test_rows_are_medians_per_train_and_step_and_of_ratios_within_a_repeat():
+    def result(seconds):
+        return {"steps": 10, "seconds": seconds, "cpu": seconds, "parts": {"step": seconds / 2}, "peak_mb": seconds}
+
+    repeats = [{"loop": result(loop), "bare": result(bare)} for loop, bare in ((3.0, 2.0), (1.0, 0.8), (2.0, 0.5))]
+    row = bench.row("loop", 100, repeats)
     assert row["us_per_train_step"] == pytest.approx(2000.0)
     assert (row["step_us"], row["read_us"], row["peak_mb"]) == (pytest.approx(1000.0), 0.0, 3.0)
     assert row["times_real_time"] == pytest.approx(5.0)
+    assert row["ratio_to_bare"] == row["cpu_ratio_to_bare"] == 1.5
+    assert bench.row("loop", 100, [{"loop": result(1.0)}])["ratio_to_bare"] is None
 
 
 def test_one_command_measures_side_by_side():

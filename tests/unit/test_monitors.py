@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -72,6 +73,25 @@ def test_the_first_violation_is_located_and_told_once(units):
     assert told(alarms, row_of(units, 9.0, speed=slow)) == [("speed_lower_mps", "5", 70.0, 79.0)]
     assert alarms.first == {"time_s": 7.0, "bound": "speed_upper_mps", "who": "2", "value": 86.5, "limit": 85.0}
     assert (alarms.total, alarms.count["speed_upper_mps", "2"]) == (2, 3)
+
+
+def test_neighbours_kept_from_step_to_step_are_those_of_a_new_sort(units):
+    """Trains pass each other, change tracks, leave a track empty: random walks of 6 trains on 3 tracks."""
+    generator = np.random.default_rng(1)
+    n, kept, alarms = len(units.scenario.train), 0, Alarms(units)
+    place, track = row_of(units).seen.position.copy(), row_of(units).track.copy()
+    for _ in range(300):
+        place += generator.normal(0.0, 300.0, n) * (generator.random() < 0.5)
+        moves = generator.random(n) < 0.05
+        track = np.where(moves, generator.integers(0, 3, n), track)
+        seen = row_of(units).seen._replace(position=place.copy())
+        before = alarms.neighbours
+        list(alarms.new(row_of(units, seen=seen, track=track)))
+        kept += alarms.neighbours is before
+        order = np.lexsort((-place, track)).tolist()
+        expected = {(a, b) for a, b in pairwise(order) if track[a] == track[b]}
+        assert set(zip(*alarms.neighbours.tolist(), strict=True)) == expected
+    assert 50 < kept < 250
 
 
 def test_spacing_and_collision(units):

@@ -169,14 +169,23 @@ class Alarms:
 
     def _collisions(self, row: Row) -> Iterator[Alarm]:
         """Trains inside one another, whatever the law: in the order of the step before, so that passing through is seen too."""
-        ids, order = self.p.scenario.ids, np.lexsort((-row.seen.position, row.track))
-        beside = row.track[order[:-1]] == row.track[order[1:]]
-        now = np.stack([order[:-1][beside], order[1:][beside]])
-        for a, b in (self.neighbours, now):
-            gap = row.seen.position[a] - self.length[a] - row.seen.position[b]
-            for k in np.flatnonzero((row.track[a] == row.track[b]) & (gap < -ROUNDING)).tolist():
-                yield from self._once("gap_m", f"{ids[a[k]]}-{ids[b[k]]}", float(gap[k]), 0.0)
-        self.neighbours = now
+        before, self.neighbours = self.neighbours, self._neighbours(row)
+        for ahead, behind in (before,) if self.neighbours is before else (before, self.neighbours):
+            gap = row.seen.position[ahead] - self.length[ahead] - row.seen.position[behind]
+            for k in np.flatnonzero((row.track[ahead] == row.track[behind]) & (gap < -ROUNDING)).tolist():
+                yield from self._once(
+                    "gap_m", f"{self.p.scenario.ids[ahead[k]]}-{self.p.scenario.ids[behind[k]]}", float(gap[k]), 0.0
+                )
+
+    def _neighbours(self, row: Row) -> Ints:
+        """Pairs of trains next to each other on one track; those of the step before (the same array), where they still hold."""
+        x, track, (ahead, behind) = row.seen.position, row.track, self.neighbours
+        pieces, tracks = len(track) - len(ahead), np.count_nonzero(np.bincount(track))
+        if pieces == tracks and (track[ahead] == track[behind]).all() and (x[ahead] >= x[behind]).all():
+            return self.neighbours
+        order = np.lexsort((-x, track))
+        beside = track[order[:-1]] == track[order[1:]]
+        return np.stack([order[:-1][beside], order[1:][beside]])
 
     def _per_train(self, key: str, value: Floats, bound: Floats, broken: Any) -> Iterator[Alarm]:
         for i in np.flatnonzero(broken).tolist():

