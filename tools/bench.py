@@ -417,6 +417,8 @@ def place(root: Path, case: str, trains: int) -> Path:
                 raise SystemExit(f"{process.args!r} failed")
     for old in ("sumo", "segments"):
         shutil.rmtree(folder / old, ignore_errors=True)
+    for table in folder.glob("*.parquet"):  # a run that ended would not be joined again
+        table.unlink()
     return folder
 
 

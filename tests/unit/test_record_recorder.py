@@ -23,11 +23,15 @@ NAMES = ["1", "2", "10"]
 TABLES = standard_tables(NAMES, ["1", "2"], ["a", "b"], watched=["gap_m"])
 
 
-def record(folder: Path, steps: int = 50, cuts: tuple[int, ...] = (), resume: dict | None = None, start: int = 0) -> list[dict]:
+def record(
+    folder: Path, steps: int = 50, cuts: tuple[int, ...] = (), resume: dict | None = None, start: int = 0, segment_groups: int = 2
+) -> list[dict]:
     """Record three trains with groups of 16 rows and segments of 2 groups; returns what each cut said."""
     folder.mkdir(exist_ok=True)
     positions = []
-    with Recorder(folder, TABLES, {"scenario_sha256": "0" * 64}, resume=resume, group_rows=16, segment_groups=2) as recorder:
+    with Recorder(
+        folder, TABLES, {"scenario_sha256": "0" * 64}, resume=resume, group_rows=16, segment_groups=segment_groups
+    ) as recorder:
         for step in range(start, steps):
             x = np.array([100.0, 50.0, 0.0]) + 10.0 * step
             recorder.write(
@@ -54,8 +58,15 @@ def test_two_recordings_are_the_same_bytes_wherever_the_segments_were_cut(tmp_pa
     record(tmp_path / "a")
     record(tmp_path / "b")
     record(tmp_path / "c", cuts=(0, 1, 7, 30, 49))
-    assert contents(tmp_path / "a") == contents(tmp_path / "b") == contents(tmp_path / "c")
+    record(tmp_path / "d", segment_groups=100)  # one segment, which becomes the file
+    assert contents(tmp_path / "a") == contents(tmp_path / "b") == contents(tmp_path / "c") == contents(tmp_path / "d")
     assert set(contents(tmp_path / "a")) == {"trains.parquet", "links.parquet", "units.parquet", "events.jsonl"}
+
+
+def test_full_groups_leave_no_empty_one_behind(tmp_path: Path) -> None:
+    record(tmp_path, steps=16, cuts=(3,))
+    file = pq.ParquetFile(tmp_path / "trains.parquet")
+    assert [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)] == [16] * 3
 
 
 def test_what_was_written_is_read_back(tmp_path: Path) -> None:

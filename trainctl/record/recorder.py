@@ -258,27 +258,18 @@ class _Segments:
         unfinished = target.with_suffix(".open")
         try:
             stream = _Stream(unfinished, self.columns, self.metadata, self.group_rows)
+            rest = stream.schema.empty_table()
             for number in range(self.count):
                 with pq.ParquetFile(self.path(number)) as file:
                     for group in range(file.num_row_groups):
-                        stream.append(self.values(file.read_row_group(group)))
+                        rest = stream.full_groups(pa.concat_tables([rest, file.read_row_group(group)]))
+            if rest.num_rows:
+                stream.writer.write_table(rest.combine_chunks())
             stream.close()
         except OSError:
             remove(unfinished)
             raise
         os.replace(unfinished, target)
-
-    def values(self, table: pa.Table) -> dict[str, NDArray[Any]]:
-        """Back from Arrow to what ``append`` takes."""
-        out: dict[str, NDArray[Any]] = {}
-        for name, column in self.columns.items():
-            array = table[name].combine_chunks()
-            if not isinstance(column, str):
-                place = {text: code for code, text in enumerate(column)}
-                codes = np.array([place[text] for text in array.dictionary.to_pylist()] + [-1], dtype=np.int32)
-                array = codes[array.indices.fill_null(-1).to_numpy(zero_copy_only=False)]
-            out[name] = array if isinstance(array, np.ndarray) else array.to_numpy(zero_copy_only=False)
-        return out
 
 
 class _Stream:
@@ -324,6 +315,13 @@ class _Stream:
             if self.filled == self.group_rows:
                 self.flush()
         self.rows += count
+
+    def full_groups(self, table: pa.Table) -> pa.Table:
+        """Write the full row groups of a table, as it is; returns the rows that are left."""
+        full = table.num_rows - table.num_rows % self.group_rows
+        for begin in range(0, full, self.group_rows):
+            self.writer.write_table(table.slice(begin, self.group_rows).combine_chunks())
+        return table.slice(full)
 
     def flush(self) -> None:
         """Write what is buffered as one row group."""
