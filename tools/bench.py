@@ -9,6 +9,7 @@ repeated with new processes, and medians are told: of times, and of ratios withi
 bare               SUMO stepping the trains, each at the constant commanded speed it starts with
 rail               SUMO's own ``Rail`` model drives the same trains on the same net
 loop               ours: ``fully_distributed`` on point trains, everything recorded
+sparse             the loop with rows, and SUMO's FCD, every 10 s only: what large networks may do with
 traci              the same loop through TraCI, SUMO in a process of its own
 client             TraCI as people write it: three reads and one command per train and step, no law, no records
 coupled_units      numeric: ``fully_distributed`` on trains of four units, sub-steps of 10 ms
@@ -39,11 +40,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 SIZES = (10, 100, 1000, 10_000)
-IN_SUMO = ("bare", "rail", "loop", "traci", "client")
+IN_SUMO = ("bare", "rail", "loop", "sparse", "traci", "client")
 ALONE = ("bare", "rail", "client")  # without our loop
 NUMERIC = ("coupled_units", "finite_time", "actuated_units")
 #: Compared to a few per cent; through TraCI everything is many times slower, which one repeat tells.
-REPEATED = ("bare", "rail", "loop")
+REPEATED = ("bare", "rail", "loop", "sparse")
 PARTS = ("read", "topology", "control", "plant", "write", "step", "record")
 SPEED_MPS = 80.0
 SPACING_M = dict.fromkeys((*IN_SUMO, *NUMERIC), 500.0) | {"finite_time": 900.0, "actuated_units": 900.0}
@@ -59,7 +60,7 @@ SLICES = 20
 def steps_of(case: str, trains: int) -> int:
     """Steps of one repeat."""
     most = 2000 if case in IN_SUMO else 100
-    least = 10 if case in WORK else 60  # closing takes 30 us per train, once
+    least = 10 if case in WORK else 100  # closing takes 30 us per train, once
     return min(most, max(least, WORK.get(case, IN_SUMO_WORK) // trains))
 
 
@@ -77,7 +78,7 @@ def scenario(case: str, trains: int, steps: int) -> tuple[str, str]:
     )
     body = [
         'schema_version = 1\ntitle = "Bench"',
-        f"[run]\nduration_s = {steps}\nstep_s = 1.0\nsub_step_s = 0.01",
+        f"[run]\nduration_s = {steps}\nstep_s = 1.0\nsub_step_s = 0.01" + ("\nrecord_every_s = 10.0" if case == "sparse" else ""),
         '[network]\nline = "line.toml"',
         _LAWS.get(case, _LAWS["loop"]),
     ]

@@ -93,6 +93,10 @@ def run(
     checkpoint_every: Annotated[
         float | None, typer.Option(help="Scenario time between two checkpoints [s]; `trainctl resume` goes on from the last one.")
     ] = None,
+    record_every: Annotated[
+        float | None,
+        typer.Option(help="Time between recorded rows [s], SUMO's FCD included; default every step."),
+    ] = None,
     settings: Settings = None,
     force: Annotated[bool, typer.Option("--force", help="Replace whatever lies at the run folder.")] = False,
     strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if any bound was broken.")] = False,
@@ -104,6 +108,8 @@ def run(
 
     if gui and backend == "numeric":
         raise InputError("--gui: shows SUMO; leave out --backend numeric")
+    if record_every is not None:
+        settings = [*(settings or []), f"run.record_every_s={record_every!r}"]
     prepared = _scenario(name, settings)
     folder = out if out is not None else Path("runs") / Path(name).stem
     shown = not (quiet or as_json)

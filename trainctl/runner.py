@@ -360,7 +360,7 @@ def open_world(p: Prepared, folder: Path, backend: Backend, gui: str | None = No
         return Numeric(p.line)
     from trainctl.sumo.session import Sumo
 
-    place = folder / "sumo"
+    run, place = p.scenario.run, folder / "sumo"
     place.mkdir()
     try:
         if p.net is None:
@@ -373,8 +373,8 @@ def open_world(p: Prepared, folder: Path, backend: Backend, gui: str | None = No
     if gui is not None:
         from trainctl.sumo.gui import Gui, Map
 
-        return (Gui if p.roster is None else Map)(p.line, net, place, p.scenario.run.step_s, p.scenario.run.steps, gui)
-    return Sumo(p.line, net, place, p.scenario.run.step_s, p.scenario.run.steps)
+        return (Gui if p.roster is None else Map)(p.line, net, place, run.step_s, run.steps, run.record_every_s, gui)
+    return Sumo(p.line, net, place, run.step_s, run.steps, run.record_every_s)
 
 
 def _quietly(function: Callable[..., None], *arguments: Any, **more: Any) -> None:

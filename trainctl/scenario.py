@@ -43,7 +43,8 @@ class Run(Table):
         0.01, description="Largest integration step inside a simulator step [s]; not used by the point plant."
     )
     record_every_s: Positive | None = Field(
-        None, description="Time between recorded rows of trains, units and links [s]; default every step. Extremes stay exact."
+        None,
+        description="Time between rows of trains, units, links and SUMO's FCD [s]; default every step. Extremes stay exact.",
     )
     seed: int | None = Field(None, ge=0, description="Seed of everything random; required as soon as something is.")
 

@@ -44,6 +44,17 @@ def test_sumo_log_holds_the_same_positions_at_the_same_times(finished, name):
     assert np.max(np.abs(both.position_m - both.vehicle_distance)) < 1e-6
 
 
+def test_rows_every_ten_seconds_are_those_of_every_step(finished, typed, tmp_path):
+    every = finished("three_tracks", **{"run.duration_s": 125})
+    assert typed("run", "three_tracks", "--record-every", "10", "--set", "run.duration_s=125", "--out", "r", "-q")[0] == 0
+    for table, time, last in (("trains.parquet", "time_s", [125]), ("sumo/fcd.parquet", "timestep_time", [])):
+        a, b = (pd.read_parquet(folder / table).dropna(subset=time) for folder in (every.folder, tmp_path / "r"))
+        assert b[time].unique().tolist() == [*range(0, 130, 10)][:13] + last
+        extremes = [c for c in b if c.endswith("_j")]  # energies since the last row
+        kept = a[a[time].isin(b[time])].drop(columns=extremes).reset_index(drop=True)
+        pd.testing.assert_frame_equal(kept, b.drop(columns=extremes).reset_index(drop=True))
+
+
 def test_nothing_but_the_plant_moved_a_train(finished):
     """SUMO reports no collision, no teleport and no warning in the default scenario."""
     run = finished("three_tracks")

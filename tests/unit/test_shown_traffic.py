@@ -12,6 +12,7 @@ import pytest
 from matplotlib.colors import to_hex
 
 from trainctl import cli
+from trainctl.errors import InputError
 from trainctl.prepare import open_scenario
 from trainctl.record import figures
 from trainctl.record.facts import facts
@@ -141,6 +142,14 @@ def test_a_run_is_shown_again_as_sumo_had_it(merging, monkeypatch):
 def test_a_run_without_sumo_is_not_shown_again(numeric):
     with pytest.raises(Exception, match="made without SUMO, which alone knows where its net lies"):
         replay(numeric, "sumo")
+
+
+def test_an_fcd_log_with_gaps_is_not_replayed(tmp_path):
+    thinned = run(open_scenario("merging", {"run.duration_s": 96, "run.record_every_s": 8}), tmp_path / "r")
+    with pytest.raises(
+        InputError, match=r"run.record_every_s = 8: trains that come and go are replayed from an FCD log of every step"
+    ):
+        replay(thinned, "sumo")
 
 
 def test_what_is_said_before_and_after_a_run(tmp_path, monkeypatch, capsys):

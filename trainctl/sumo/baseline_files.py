@@ -14,7 +14,7 @@ from trainctl.controllers.sumo import SIGNALS_M
 from trainctl.errors import InputError
 from trainctl.prepare import Prepared
 from trainctl.signals import SPEED, Floats
-from trainctl.sumo.session import OPTIONS, normal
+from trainctl.sumo.session import OPTIONS, fcd_period, normal
 
 
 class Stop(NamedTuple):
@@ -155,6 +155,7 @@ def write_configuration(p: Prepared, net: str, folder: Path) -> Path:
         "net-file": net, "route-files": "trains.rou.xml", "begin": "0", "step-length": f"{p.scenario.run.step_s:g}",
         **{key: value for key, value in OPTIONS.items() if key != "insertion-checks"},
         **({"collision.check-junctions": "true"} if internal else {"no-internal-links": "true"}),
+        **fcd_period(p.scenario.run.record_every_s),
         **({"railsignal-moving-block": "true"} if p.params.block == "moving" else {}),
     }  # fmt: skip
     path = folder / "run.sumocfg"

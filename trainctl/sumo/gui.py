@@ -65,7 +65,7 @@ class Gui(Sumo):
 
     Parameters
     ----------
-    line, net, folder, step, steps
+    line, net, folder, step, steps, record_every
         As of ``Sumo``.
     binary : str
         Program to start.
@@ -76,9 +76,10 @@ class Gui(Sumo):
     api: Any = traci
 
     def __init__(
-        self, line: Line, net: Path, folder: Path, step: float, steps: int, binary: str = "sumo-gui", delay_ms: float = 20.0
-    ) -> None:
-        super().__init__(line, net, folder, step, steps)
+        self, line: Line, net: Path, folder: Path, step: float, steps: int, record_every: float | None = None,
+        binary: str = "sumo-gui", delay_ms: float = 20.0,
+    ) -> None:  # fmt: skip
+        super().__init__(line, net, folder, step, steps, record_every)
         self.binary, self.delay_ms = binary, delay_ms
         self.links: Links | None = None
         self.shown: set[str] = set()

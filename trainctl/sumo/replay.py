@@ -68,7 +68,7 @@ def replay(run: Run, binary: str = "sumo-gui", from_s: float = 0.0, delay_ms: fl
         line, net = _network(run, scenario, Path(scratch))
         edge = np.array([[line.index[name] for name in row] for row in edge_names[: len(times)]])
         links = _changes(run, times, ids, _tracks(line)[edge], position)
-        gui = Gui(line, net, Path(scratch), step, len(times), binary, delay_ms)
+        gui = Gui(line, net, Path(scratch), step, len(times), binary=binary, delay_ms=delay_ms)
         try:
             gui.start(_start(scenario, line, edge, position[0], speed[0]))
             for k, (now, then) in enumerate(pairwise(times.tolist())):
@@ -99,6 +99,9 @@ def _traffic(run: Run, scenario: Scenario, binary: str, from_s: float, delay_ms:
     if len(times) < 2:
         raise InputError(f"{run.folder}: fewer than two instants recorded from {from_s:g} s on")
     step = scenario.run.step_s
+    if scenario.run.recorded_steps > 1:
+        every = scenario.run.record_every_s
+        raise InputError(f"run.record_every_s = {every:g}: trains that come and go are replayed from an FCD log of every step")
     times = times[0] + step * np.arange(1 + round(float(times[-1] - times[0]) / step))
     ids = [i for i in scenario.ids if i in set(seen["train"])]
     number = {name: i for i, name in enumerate(ids)}
@@ -123,7 +126,7 @@ def _traffic(run: Run, scenario: Scenario, binary: str, from_s: float, delay_ms:
     with tempfile.TemporaryDirectory(prefix="replay.") as scratch:
         net = Path(scratch) / nets[0].name
         net.write_bytes(nets[0].read_bytes())
-        gui = Map(chart(rails), net, Path(scratch), step, len(times), binary, delay_ms)
+        gui = Map(chart(rails), net, Path(scratch), step, len(times), binary=binary, delay_ms=delay_ms)
         try:
             gui.start(start)
             for k, now in enumerate(times[:-1].tolist()):

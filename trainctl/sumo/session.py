@@ -103,14 +103,26 @@ def normal(route: Iterable[str]) -> list[str]:
     return [edge for edge in route if not edge.startswith(":")]
 
 
-def write_configuration(folder: Path, net: str, routes: str, step: float, end: float, internal: bool = False) -> Path:
-    """``run.sumocfg``: SUMO's own sumo and sumo-gui open it. ``internal`` says whether the net has edges inside junctions."""
+def write_configuration(
+    folder: Path, net: str, routes: str, step: float, end: float, internal: bool = False, record_every: float | None = None
+) -> Path:
+    """``run.sumocfg``: SUMO's own sumo and sumo-gui open it.
+
+    ``internal`` says whether the net has edges inside junctions, ``record_every`` [s] how often the FCD log is written: it takes a
+    third of SUMO's time.
+    """
     options = {"net-file": net, "route-files": routes, "begin": "0", "end": f"{end:.3f}", "step-length": f"{step:g}", **OPTIONS}
+    options |= fcd_period(record_every)
     options |= {"collision.check-junctions": "true"} if internal else {"no-internal-links": "true"}
     path = folder / "run.sumocfg"
     body = "".join(f"    <{key} value={quoteattr(value)}/>\n" for key, value in options.items())
     path.write_text(f"<configuration>\n{body}</configuration>\n", encoding="utf-8")
     return path
+
+
+def fcd_period(every: float | None) -> dict[str, str]:
+    """Options for an FCD log with rows every so often [s]; every step if None."""
+    return {} if every is None else {"device.fcd.period": f"{every:g}"}
 
 
 def messages(log: Path) -> list[tuple[float | None, str]]:
@@ -126,15 +138,16 @@ def messages(log: Path) -> list[tuple[float | None, str]]:
 
 
 class Sumo:
-    """One libsumo simulation. ``folder`` receives SUMO's inputs and its own logs.
+    """One libsumo simulation. ``folder`` receives SUMO's inputs and its own logs, FCD with rows every ``record_every`` seconds.
 
     ``api`` is the module that talks to SUMO: libsumo, or another with the same functions.
     """
 
     api: Any = libsumo
 
-    def __init__(self, line: Line, net: Path, folder: Path, step: float, steps: int) -> None:
+    def __init__(self, line: Line, net: Path, folder: Path, step: float, steps: int, record_every: float | None = None) -> None:
         self.line, self.net, self.folder, self.time_step, self.steps = line, net, folder, step, steps
+        self.record_every = record_every
         self.internal = any(edge.startswith(":") for edge in line.edges)
         self.began = False
 
@@ -146,7 +159,9 @@ class Sumo:
             raise SimulatorError("; ".join(wrong))
         self.kinds = write_routes(start, self.folder / "trains.rou.xml")
         end = (self.steps + 1) * self.time_step
-        configuration = write_configuration(self.folder, self.net.name, "trains.rou.xml", self.time_step, end, self.internal)
+        configuration = write_configuration(
+            self.folder, self.net.name, "trains.rou.xml", self.time_step, end, self.internal, self.record_every
+        )
         self._lane_position, self._set_speed = _direct(self.api.vehicle.getLanePosition), _direct(self.api.vehicle.setSpeed)
         self.ids, self.routes, self.departs_m = list(start.ids), list(start.routes), start.lane_position
         self.ways = lay_out(self.line, start)
