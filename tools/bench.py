@@ -367,7 +367,7 @@ def through_traci() -> Any:
 def child(case: str, folder: Path) -> None:
     """What runs in a process of its own: as many steps as each line of its input says; at the end, one JSON object."""
     running = client(folder) if case == "client" else (alone if case in ALONE else closed)(folder, case)
-    seconds = cpu = 0.0
+    seconds, cpu = 0.0, -sum(os.times()[2:4])  # netconvert is behind us
     print("ready", flush=True)
     for line in sys.stdin:
         steps = int(line)
@@ -379,7 +379,7 @@ def child(case: str, folder: Path) -> None:
         seconds += time.perf_counter() - began
         cpu += time.process_time() - busy
         print("done", flush=True)
-    cpu += sum(os.times()[2:4])  # SUMO behind TraCI, from its start on
+    cpu += sum(os.times()[2:4])  # SUMO behind TraCI
     print(json.dumps({
         "trains": running.trains, "seconds": seconds, "cpu": cpu, "parts": running.clock.spent, "peak_mb": peak_mb(),
     }))  # fmt: skip

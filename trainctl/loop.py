@@ -384,9 +384,9 @@ class Simulation:
 
     def _check(self, t: float, motion: Motion) -> None:
         """Numbers must stay finite; a train never moves backwards; bounds that break are told once."""
-        finite = np.logical_and.reduceat(np.isfinite(self.own).all(axis=1), self.p.heads)
-        wrong = np.flatnonzero(~(finite & np.isfinite(motion.displacement)))
-        if len(wrong):
+        if not (np.isfinite(self.own).all() and np.isfinite(motion.displacement).all()):
+            finite = np.logical_and.reduceat(np.isfinite(self.own).all(axis=1), self.p.heads)
+            wrong = np.flatnonzero(~(finite & np.isfinite(motion.displacement)))
             names = ", ".join(self.p.scenario.ids[i] for i in wrong)
             raise LawError(f"the state of train {names} is no longer finite after {t:g} s: the law or the step diverged")
         for i in np.flatnonzero(motion.clipped).tolist():

@@ -165,6 +165,7 @@ class Sumo:
         self._lane_position, self._set_speed = _direct(self.api.vehicle.getLanePosition), _direct(self.api.vehicle.setSpeed)
         self.ids, self.routes, self.departs_m = list(start.ids), list(start.routes), start.lane_position
         self.ways = lay_out(self.line, start)
+        self.way_end = self._way_end()
         self.coming: list[tuple[int, float]] = []
         logs = [part for key, name in LOGS.items() for part in (f"--{key}", str(self.folder / name))]
         self._call(self._launch, ["-c", str(configuration), *logs])
@@ -256,6 +257,7 @@ class Sumo:
         self._call(self.api.vehicle.setRoute, self.ids[train], normal(edges))
         line, row, before = self.line, int(self.seen.row[train]), self.ways.first
         self.ways = rerouted(self.ways, train, row, [line.index[e] for e in edges], line.start_m, line.length_m)
+        self.way_end = self._way_end()
         self.seen = self.seen._replace(row=self.seen.row + self.ways.first[:-1] - before[:-1])
 
     def insert(self, train: int, speed: float) -> None:
@@ -291,13 +293,16 @@ class Sumo:
 
     def _left(self, wanted: Floats, present: Bools) -> Bools:
         """Which trains have left the net at the end of their way."""
-        last = self.ways.first[1:] - 1
-        end = self.ways.begin[last] + self.line.length_m[self.ways.edge[last]]
-        near = present & (wanted > end - LEAVES_M - TOLERANCE_M)
+        near = present & (wanted > self.way_end - LEAVES_M - TOLERANCE_M)
         if near.any():
             gone = set(self.api.simulation.getArrivedIDList())
             near &= np.array([name in gone for name in self.ids])
         return near
+
+    def _way_end(self) -> Floats:
+        """Where the way of each train ends (n,) [m]."""
+        last = self.ways.first[1:] - 1
+        return np.asarray(self.ways.begin[last] + self.line.length_m[self.ways.edge[last]])
 
     def _command(self, trains: Ints, speeds: Floats) -> None:
         names = self.ids if len(trains) == len(self.ids) else [self.ids[i] for i in trains.tolist()]

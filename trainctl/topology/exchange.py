@@ -66,6 +66,6 @@ class Exchange:
             arrives &= reach(position, links, self.radius)
         if self.loss > 0.0:
             arrives &= np.random.default_rng([self.seed, LOSS_STREAM, count]).random(len(arrives)) >= self.loss
-        self.heard[arrives] = self.sent[0][links.sender[arrives]]
+        np.copyto(self.heard, self.sent[0][links.sender], where=arrives[:, None])
         self.ever |= arrives
         return arrives
