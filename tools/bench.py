@@ -21,6 +21,9 @@ The net is fixed: three parallel tracks cut into edges of 5 km, ``bench_three_tr
 SUMO are those of a run (``trainctl.sumo.session.OPTIONS``) in all cases with SUMO. A figure is the time from the first step
 until the logs are closed, per train and step [us]; ``peak_mb`` is the peak resident memory of the process that steps. Time of the
 processor is told too (``cpu_``, all threads): where others use the machine it is the truer figure.
+
+``--instructions`` counts instead of measuring: instructions per train and step, by valgrind, which must be installed. They are no
+times (a cache miss is not seen), but the same whatever else the machine does: they tell whether a change made anything cheaper.
 """
 
 from __future__ import annotations
@@ -28,6 +31,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import shutil
 import statistics
 import subprocess
@@ -52,6 +56,9 @@ SPACING_M = dict.fromkeys((*IN_SUMO, *NUMERIC), 500.0) | {"finite_time": 900.0, 
 #: Train-steps of one repeat, about; the slower a case, the fewer.
 WORK = {"traci": 15_000, "client": 10_000, "coupled_units": 15_000, "finite_time": 15_000, "actuated_units": 9_000}
 IN_SUMO_WORK = 120_000
+
+#: Steps of the two runs whose instructions are compared; in between, the recorder writes at 1000 trains what 66 steps hold.
+COUNTED = (10, 76)
 
 #: Turns the cases take within a repeat: at 1000 trains, some 30 ms of each.
 SLICES = 20
@@ -458,6 +465,40 @@ def bench(root: Path, sizes: list[int], cases: list[str], repeats: int) -> list[
     return rows
 
 
+def instructions(root: Path, case: str, trains: int) -> dict[str, Any]:
+    """Instructions per train and step: those of a longer run of a case without those of a shorter one."""
+    folder, counts = place(root, case, trains), []
+    # valgrind knows no AVX-512; kernels are compiled in a run of their own
+    environment = {"NUMBA_CPU_NAME": "x86-64-v2", "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": str(root / "kernels")}
+    command, counter = [sys.executable, __file__, "--case", case, str(folder)], ["valgrind", "--tool=callgrind"]
+    for tool, steps in (([], 0), *(([*counter, f"--callgrind-out-file={os.devnull}"], steps) for steps in COUNTED)):
+        place(root, case, trains)  # without what the run before left
+        done = subprocess.run(
+            [*tool, *command], input=f"{steps}\n" if steps else "", env={**os.environ, **environment}, capture_output=True,
+            text=True, check=False,
+        )  # fmt: skip
+        found = re.search(r"Collected : (\d+)", done.stderr)
+        if done.returncode or (tool and found is None):
+            raise SystemExit(f"{' '.join([*tool, *command])} failed:\n{done.stderr[-2000:]}")
+        counts += [int(found.group(1))] if found else []
+    return {"case": case, "trains": trains, "instructions": round((counts[1] - counts[0]) / trains / (COUNTED[1] - COUNTED[0]))}
+
+
+def counted(root: Path, sizes: list[int], cases: list[str]) -> list[dict[str, Any]]:
+    """Rows of instructions, and how they compare with the bare step."""
+    if shutil.which("valgrind") is None:
+        raise SystemExit("--instructions: valgrind is not installed")
+    rows = []
+    for trains in sizes:
+        found = []
+        for case in cases:
+            print(f"{trains} trains: instructions of {case}", file=sys.stderr)
+            found.append(instructions(root, case, trains))
+        bare = next((r["instructions"] for r in found if r["case"] == "bare"), None)
+        rows += [{**r, "ratio_to_bare": round(r["instructions"] / bare, 3) if bare else None} for r in found]
+    return rows
+
+
 def row(case: str, trains: int, repeats: list[dict[str, dict[str, Any]]]) -> dict[str, Any]:
     """Medians of the repeats of one case; each repeat has the results of all cases that ran."""
 
@@ -484,17 +525,18 @@ def row(case: str, trains: int, repeats: list[dict[str, dict[str, Any]]]) -> dic
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Rows in columns, with how the cost grows with the number of trains."""
-    columns = [
-        "case", "trains", "us_per_train_step", "ratio_to_bare", "cpu_us_per_train_step", "cpu_ratio_to_bare", "times_real_time",
-        "peak_mb", *(f"{p}_us" for p in PARTS),
-    ]  # fmt: skip
-    heads = ["case", "trains", "us/train-step", "to bare", "CPU us", "CPU to bare", "x real time", "peak MB", *PARTS]
-    lines = [heads, *([("" if r[c] is None else str(r[c])) for c in columns] for r in rows)]
-    width = [max(len(line[k]) for line in lines) for k in range(len(heads))]
+    named = {
+        "case": "case", "trains": "trains", "instructions": "instructions", "us_per_train_step": "us/train-step",
+        "ratio_to_bare": "to bare", "cpu_us_per_train_step": "CPU us", "cpu_ratio_to_bare": "CPU to bare",
+        "times_real_time": "x real time", "peak_mb": "peak MB", **{f"{p}_us": p for p in PARTS},
+    }  # fmt: skip
+    columns = [c for c in named if c in rows[0]]
+    lines = [[named[c] for c in columns], *(["" if r[c] is None else str(r[c]) for c in columns] for r in rows)]
+    width = [max(len(line[k]) for line in lines) for k in range(len(columns))]
     text = [
         "  ".join(c.ljust(w) if k == 0 else c.rjust(w) for k, (c, w) in enumerate(zip(line, width, strict=True))) for line in lines
     ]
-    for case in dict.fromkeys(r["case"] for r in rows):
+    for case in dict.fromkeys(r["case"] for r in rows if "us_per_train_step" in r):
         own = {r["trains"]: r["us_per_train_step"] for r in rows if r["case"] == case}
         if {100, 10_000} <= own.keys():
             text.append(f"{case}: cost per train-step grows {own[10_000] / own[100]:.2f} times from 100 to 10000 trains")
@@ -507,6 +549,7 @@ def main() -> None:
     parser.add_argument("--trains", type=int, action="append", help="number of trains; repeatable; default 10, 100, 1000, 10000")
     parser.add_argument("--only", action="append", choices=[*IN_SUMO, *NUMERIC], help="this case; repeatable; default all")
     parser.add_argument("--repeats", type=int, default=3, help="repeats of each case; the median is told")
+    parser.add_argument("--instructions", action="store_true", help="count instructions with valgrind: repeatable, but slow")
     parser.add_argument("--json", action="store_true", help="print a list of rows for machines")
     parser.add_argument("--case", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--inputs", nargs=4, help=argparse.SUPPRESS)
@@ -518,7 +561,11 @@ def main() -> None:
         child(asked.case[0], Path(asked.case[1]))
     else:
         with tempfile.TemporaryDirectory(prefix="trainctl-bench-") as root:
-            rows = bench(Path(root), asked.trains or list(SIZES), asked.only or [*IN_SUMO, *NUMERIC], asked.repeats)
+            sizes, cases = asked.trains or list(SIZES), asked.only
+            if asked.instructions:
+                rows = counted(Path(root), asked.trains or [1000], cases or ["bare", "rail", "loop"])
+            else:
+                rows = bench(Path(root), sizes, cases or [*IN_SUMO, *NUMERIC], asked.repeats)
         print(json.dumps(rows, indent=2) if asked.json else table(rows))
 
 
