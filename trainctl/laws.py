@@ -61,8 +61,8 @@ def find_law(name: str, folder: Path = Path()) -> Any:
 
 
 def _law_file(file: Path) -> Any:
-    """A law's file as a module, read anew each time; what else has the same stem is another module."""
-    name = f"trainctl_law_{file.stem}_{hashlib.sha256(file.read_bytes()).hexdigest()[:16]}"
+    """A law's file as a module, read anew each time; another file of the same name is another module."""
+    name = f"trainctl_law_{file.stem}_{hashlib.sha256(str(file.resolve()).encode()).hexdigest()[:16]}"
     spec = importlib.util.spec_from_file_location(name, file.resolve())
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)

@@ -4,8 +4,12 @@ import json
 import os
 import subprocess
 import sys
+from collections import namedtuple
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 
@@ -251,22 +255,27 @@ def test_another_process_finds_everything_compiled() -> None:
     assert elsewhere("cache") == [0, 0, 0, 0]
 
 
-def test_a_law_that_is_gone_from_the_cache_s_index_does_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Stale:
-        """A dispatcher whose cache cannot be read until it is emptied."""
+def first_of(constants: Any) -> float:
+    return constants[0]  # type: ignore[no-any-return]
 
-        def __init__(self) -> None:
-            self._cache = self
-            self.flushed = False
 
-        def flush(self) -> None:
-            self.flushed = True
+def test_a_law_that_is_gone_costs_nobody_else_anything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Types are kept by name: an index that names a module which cannot be imported any more is lost as a whole."""
+    monkeypatch.setattr(integrate.config, "CACHE_DIR", str(tmp_path))
+    gone = ModuleType("gone_law")
+    gone.Constants = namedtuple("Constants", "x", module="gone_law")  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "gone_law", gone)
 
-        def compile(self, arguments: Any) -> Any:
-            if not self.flushed:
-                raise ModuleNotFoundError("No module named 'somebodys_law'")
-            return arguments
+    def from_cache(place: str, constants: Any) -> tuple[float, int]:
+        """What comes out, and how often it was found compiled."""
+        kernel = numba.njit(cache=True)(first_of)
+        value = integrate.from_cache(kernel, place, (numba.typeof(constants),))(constants)
+        return value, sum(kernel.stats.cache_hits.values())  # type: ignore[return-value]
 
-    stale = Stale()
-    monkeypatch.setattr(integrate, "KERNELS", (stale,))
-    assert integrate.from_cache(stale, ("types",)) == ("types",)
+    theirs, ours = gone.Constants(3.0), none.Constants(4.0)
+    assert [from_cache("a", theirs), from_cache("b", ours)] == [(3.0, 0), (4.0, 0)]
+    assert [from_cache("a", theirs), from_cache("b", ours)] == [(3.0, 1), (4.0, 1)]
+    monkeypatch.delitem(sys.modules, "gone_law")
+    assert from_cache("b", ours) == (4.0, 1)
+    assert [from_cache("a", ours), from_cache("a", ours)] == [(4.0, 0), (4.0, 1)]
+    assert str(tmp_path) == integrate.config.CACHE_DIR

@@ -14,7 +14,7 @@ import pytest
 import trainctl
 from trainctl import laws
 from trainctl.controllers import emu_finite_time
-from trainctl.errors import InputError
+from trainctl.errors import InputError, LawError
 from trainctl.laws import find_law
 from trainctl.new import controller
 from trainctl.plants.integrate import described, part
@@ -122,13 +122,18 @@ def test_a_law_offered_by_a_package_must_be_a_module(monkeypatch):
         find_law("odd")
 
 
-def test_a_changed_law_is_another_module(tmp_path):
-    """Kernels are cached by the module's name: an old one must not serve a law that was edited."""
-    (tmp_path / "mine.py").write_text(Path(emu_finite_time.__file__).read_text())
-    before = find_law("mine.py", tmp_path)
-    (tmp_path / "mine.py").write_text(Path(emu_finite_time.__file__).read_text() + "\n")
-    after = find_law("mine.py", tmp_path)
-    assert before.__name__ != after.__name__
-    assert described(before) != described(after)
-    assert part(described(before), 0, "demand") is before.demand
-    assert part(described(after), 0, "demand") is after.demand
+def test_a_law_read_again_is_not_mixed_with_the_one_before(tmp_path):
+    """Kernels are compiled of what the names of modules stand for, and cached by what stands in their files."""
+    source = Path(emu_finite_time.__file__).read_text()
+    for folder in ("here", "there"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "mine.py").write_text(source)
+    here, there = (find_law("mine.py", tmp_path / folder) for folder in ("here", "there"))
+    assert part(described(here), 0, "demand") is here.demand
+    assert part(described(there), 0, "demand") is there.demand
+    before = described(here)
+    (tmp_path / "here" / "mine.py").write_text(source + "\n")
+    again = find_law("mine.py", tmp_path / "here")
+    assert described(again) != before
+    with pytest.raises(LawError, match=r"mine\.py: was read again since this scenario was opened"):
+        described(here)

@@ -18,6 +18,7 @@ import numba
 import numpy as np
 from numba.extending import overload
 
+from trainctl.errors import LawError
 from trainctl.kernels import bare
 from trainctl.signals import FORCE, POWERS, Floats, Ints, Links, Reference, leader_at
 
@@ -146,7 +147,7 @@ def add(lift, sign, a, b, applied):  # type: ignore[no-untyped-def]
             applied[u] += sign * lift[u]
 
 
-@bare()
+@bare(cache=False)
 def stage(code, loop, first, links, reference, air, t, inside, own, estimate, work, low, high):  # type: ignore[no-untyped-def]
     """Evaluate the closed loop of trains ``low`` to ``high`` at one instant: fills ``work`` with forces and rates.
 
@@ -211,7 +212,7 @@ def exchange_kernel(code, loop, first, links, reference, air, t, own, estimate, 
         message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
 
 
-@bare()
+@bare(cache=False)
 def see(code, loop, first, length, links, t, own, work, extremes, low, high):  # type: ignore[no-untyped-def]
     """Widen ``extremes`` of trains ``low`` to ``high`` by the state and the forces of this instant; what is NaN widens nothing."""
     watch = part(code, LAW, "watch")
@@ -273,7 +274,7 @@ def advance_kernel(code, loop, first, length, links, reference, air, t, h, n, br
         )  # fmt: skip
 
 
-@bare()
+@bare(cache=False)
 def stretch(code, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes, low, high):  # type: ignore[no-untyped-def]
     """Integrate trains ``low`` to ``high``."""
     a, b = first[low], first[high]
@@ -333,6 +334,9 @@ def part_compiled(code, owner, name):  # type: ignore[no-untyped-def]
 
 def described(*modules: Any) -> str:
     """Names of these modules, then digests of their files: kernels are compiled for, and cached by, this text."""
+    for module in modules:
+        if sys.modules.get(module.__name__) is not module:
+            raise LawError(f"{module.__file__}: was read again since this scenario was opened: open it again")
     digests = (hashlib.sha256(Path(module.__file__).read_bytes()).hexdigest()[:16] for module in modules)
     return " ".join([*(module.__name__ for module in modules), *digests])
 
@@ -348,27 +352,26 @@ def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...]) ->
         return Parts(code, advance_kernel, exchange_kernel)
     loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes = (typeof(a) for a in arguments)
     text = types.literal(code)
-    return Parts(
-        code,
-        from_cache(
-            advance_kernel, (text, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes)
-        ),
-        from_cache(exchange_kernel, (text, loop, first, links, reference, air, t, own, estimate, work)),
-    )
+    to_advance = (text, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes)
+    to_exchange = (text, loop, first, links, reference, air, t, own, estimate, work)
+    place = hashlib.sha256(" ".join(m.__file__ for m in (law, observer, plant)).encode()).hexdigest()[:16]
+    return Parts(code, from_cache(advance_kernel, place, to_advance), from_cache(exchange_kernel, place, to_exchange))
 
 
-#: Whose caches on disk name the types of laws, observers and plants.
-KERNELS: tuple[Any, ...] = (stage, see, stretch, advance_kernel, exchange_kernel)
+def from_cache(kernel: Any, place: str, arguments: tuple[Any, ...]) -> Callable[..., None]:
+    """Compile for these types, or load what was compiled before and kept in the folder ``place``.
 
-
-def from_cache(function: Any, arguments: tuple[Any, ...]) -> Callable[..., None]:
-    """Compile for these types, or load what was compiled before."""
+    One folder per law, observer and plant: an index names the types of laws, and none of it can be read where one of them is gone.
+    """
+    kept, config.CACHE_DIR = config.CACHE_DIR, str(Path(config.CACHE_DIR) / place)
     try:
-        return function.compile(arguments)  # type: ignore[no-any-return]
-    except (ImportError, AttributeError):  # a law that is no longer installed, or has changed its names
-        for kernel in KERNELS:
-            kernel._cache.flush()
-        return function.compile(arguments)  # type: ignore[no-any-return]
+        kernel.enable_caching()
+        return kernel.compile(arguments)  # type: ignore[no-any-return]
+    except (ImportError, AttributeError):  # what this law took from elsewhere is no longer there
+        kernel._cache.flush()
+        return kernel.compile(arguments)  # type: ignore[no-any-return]
+    finally:
+        config.CACHE_DIR = kept
 
 
 def advance(
