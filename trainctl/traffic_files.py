@@ -1,0 +1,161 @@
+"""The files of a SUMO configuration: its options, the demand in them sorted by kind, and times and numbers as SUMO writes them."""
+
+from __future__ import annotations
+
+import gzip
+import math
+import re
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+from trainctl.errors import InputError
+
+#: What SUMO calls one thing: the places a train can stop at.
+PLACES = ("trainStop", "busStop", "containerStop", "parkingArea", "chargingStation", "overheadWireSegment")
+#: Short names of options, and the long ones.
+_OPTIONS = {
+    "n": "net-file", "net": "net-file", "r": "route-files", "routes": "route-files", "a": "additional-files",
+    "additional": "additional-files", "b": "begin", "e": "end",
+}  # fmt: skip
+_TRAINS = ("vehicle", "trip", "flow")
+#: Who else travels: only counted.
+PEOPLE = {"person": "persons", "personFlow": "persons", "container": "containers", "containerFlow": "containers"}
+
+
+class Demand(NamedTuple):
+    """The files of a configuration, sorted by kind."""
+
+    types: dict[str, Element]
+    mixes: dict[str, Element]  # vType distributions
+    routes: dict[str, Element]
+    drawn: dict[str, Element]  # route distributions
+    trains: list[Element]
+    places: dict[str, Element]
+    seen: dict[str, int]  # how many persons, containers, rerouters
+
+
+def parse(path: Path) -> Element:
+    """Root of an XML file, which may be compressed."""
+    try:
+        content = path.read_bytes()
+        content = gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content
+        if b"<!DOCTYPE" in content:
+            raise InputError(f"{path}: declares a document type, which a SUMO file does not")
+        return ElementTree.fromstring(content)
+    except gzip.BadGzipFile as error:
+        raise InputError(f"{path}: not XML: {error}") from None
+    except OSError as error:
+        raise InputError(f"{path}: {'no such file' if isinstance(error, FileNotFoundError) else error.strerror}") from None
+    except (ElementTree.ParseError, EOFError, LookupError, ValueError, zlib.error) as error:
+        raise InputError(f"{path}: not XML: {error}") from None
+
+
+def read_options(sumocfg: Path) -> dict[str, str]:
+    """Options of a configuration, short names spelled out."""
+    root = parse(sumocfg)
+    if root.tag not in ("configuration", "sumoConfiguration"):
+        raise InputError(f"{sumocfg}: not a SUMO configuration: it begins with <{root.tag}>, not <sumoConfiguration>")
+    said = {e.tag: value for e in root.iter() if (value := e.get("value", e.get("v"))) is not None}
+    return {_OPTIONS.get(key, key): value for key, value in said.items()}
+
+
+def named_files(sumocfg: Path, options: dict[str, str], key: str) -> list[Path]:
+    """Files that an option of a configuration names."""
+    return [sumocfg.parent / name.strip() for name in re.split(r"[,;]", options.get(key, "")) if name.strip()]
+
+
+def read_demand(files: list[Path]) -> Demand:
+    """What route files and additional files say, with the files they include; a name may be given once."""
+    d = Demand({}, {}, {}, {}, [], {}, {})
+    named = {"vType": d.types, "vTypeDistribution": d.mixes, "route": d.routes, "routeDistribution": d.drawn}
+    wrong = []
+    for path in files:
+        for element in _elements(path):
+            tag = element.tag
+            if tag in _TRAINS:
+                d.trains.append(element)
+            elif tag in named or tag in PLACES:
+                # The members of a distribution have a name of their own.
+                members = [e for e in element if tag in ("vTypeDistribution", "routeDistribution") and not e.get("refId")]
+                for e in (element, *members):
+                    table, name = named.get(e.tag, d.places), e.get("id", "")
+                    wrong += [f"{path}: {e.tag} {name}: there are several of this id"] if name in table else []
+                    if name:
+                        table[name] = e
+                    elif e is element:
+                        wrong.append(f"{path}: a {tag} has no id")
+            elif tag in PEOPLE or tag == "rerouter":
+                d.seen[tag] = d.seen.get(tag, 0) + 1
+    if wrong:
+        raise InputError(list(dict.fromkeys(wrong)))
+    return d
+
+
+def _elements(path: Path, within: tuple[Path, ...] = ()) -> Iterator[Element]:
+    """What a file says at its top, with the files it includes."""
+    if path.resolve() in within:
+        raise InputError(f"{path}: includes itself")
+    for element in parse(path):
+        if element.tag == "include":
+            yield from _elements(path.parent / element.get("href", ""), (*within, path.resolve()))
+        else:
+            yield element
+
+
+def types_of(mix: Element) -> list[str]:
+    """Names of the vTypes in a distribution."""
+    return [e.get("id", e.get("refId", "")) for e in mix if e.tag == "vType"] + mix.get("vTypes", "").split()
+
+
+def routes_of(train: Element, demand: Demand) -> list[Element]:
+    """The routes a train is given, none for a trip."""
+    own = [r for r in train.iter("route") if r.get("edges")]
+    name = train.get("route", "")
+    mix = demand.drawn.get(name) if name else train.find("routeDistribution")
+    if mix is not None:
+        own = [r for r in mix if r.get("edges")]
+        own += [
+            demand.routes[n] for n in (*mix.get("routes", "").split(), *(r.get("refId", "") for r in mix)) if n in demand.routes
+        ]
+    return own or ([demand.routes[name]] if name in demand.routes else [])
+
+
+def bad_number(text: str | None) -> bool:
+    """Whether a text is no number, or a negative one."""
+    try:
+        return text is not None and not 0.0 <= float(text) < math.inf
+    except ValueError:
+        return True
+
+
+def bad_time(text: str) -> bool:
+    """Whether a text is no time, or a negative one."""
+    return not is_time(text) or seconds(text) < 0
+
+
+def is_number(text: str) -> bool:
+    """Whether a text is a finite number."""
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def is_time(text: str) -> bool:
+    """Whether a text is a time that ``seconds`` reads."""
+    try:
+        return math.isfinite(seconds(text))
+    except ValueError:
+        return False
+
+
+def seconds(text: str) -> float:
+    """A time as SUMO writes it: seconds, or [days:]hours:minutes:seconds."""
+    value = 0.0
+    for part, base in zip(text.split(":"), (1.0, *((24.0,) if text.count(":") == 3 else ()), 60.0, 60.0), strict=False):
+        value = value * base + float(part)
+    return value
