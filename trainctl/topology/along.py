@@ -18,6 +18,7 @@ from numba import njit
 
 from trainctl.kernels import keep_by_sources
 from trainctl.signals import Bools, Floats, Ints
+from trainctl.topology.rows import approaches, pieces
 from trainctl.topology.ways import Ways
 
 keep_by_sources()  # before anything below is decorated
@@ -153,13 +154,13 @@ def places(
         Input of ``ahead`` and ``obstacles``.
     """
     edges = len(net.length)
-    train, at = _pieces(ways, row, s, length, present)
+    train, at = pieces(ways, row, s, length, present)
     depth = s[train] - ways.begin[at]
     by_depth = np.lexsort((-train, depth, ways.edge[at]))
     front = np.full(len(row), -1, np.int64)
     standing = np.flatnonzero(at[by_depth] == row[train[by_depth]])
     front[train[by_depth[standing]]] = standing
-    own_first, comer, join_row = _approaches(ways, net.joins, row, s, present, horizon)
+    own_first, comer, join_row = approaches(ways, net.joins, row, s, present, horizon)
     join = ways.edge[join_row]
     rank = np.full(len(comer), UNDECIDED, np.int64)
     if order is not None:
@@ -263,50 +264,6 @@ def obstacles(places: Places, virtual: bool = True) -> Obstacles:
 def _starts(edge: Ints, edges: int) -> Ints:
     """Where the entries of every edge begin in a list sorted by edge, shape (E + 1,)."""
     return np.concatenate([[0], np.cumsum(np.bincount(edge, minlength=edges))]).astype(np.int64)
-
-
-@njit(cache=True)
-def _pieces(ways: Ways, row: Ints, s: Floats, length: Floats, present: Bools) -> tuple[Ints, Ints]:
-    """Every train on every edge its body is on: train and row, shape (P,) each."""
-    count = 0
-    for again in range(2):
-        if again:
-            train, at = np.empty(count, np.int64), np.empty(count, np.int64)
-        count = 0
-        for i in range(len(row)):
-            if not present[i]:
-                continue
-            k = row[i]
-            while True:
-                if again:
-                    train[count], at[count] = i, k
-                count += 1
-                if k == ways.first[i] or ways.begin[k] <= s[i] - length[i]:
-                    break
-                k -= 1
-    return train, at
-
-
-@njit(cache=True)
-def _approaches(ways: Ways, joins: Bools, row: Ints, s: Floats, present: Bools, horizon: float) -> tuple[Ints, Ints, Ints]:
-    """Joins ahead of every train within the horizon: first (n + 1,), then train and row, shape (R,) each."""
-    first = np.zeros(len(row) + 1, np.int64)
-    count = 0
-    for again in range(2):
-        if again:
-            train, at = np.empty(count, np.int64), np.empty(count, np.int64)
-        count = 0
-        for i in range(len(row)):
-            if present[i]:
-                for k in range(row[i] + 1, ways.first[i + 1]):
-                    if ways.begin[k] - s[i] > horizon:
-                        break
-                    if joins[ways.edge[k]]:
-                        if again:
-                            train[count], at[count] = i, k
-                        count += 1
-            first[i + 1] = count
-    return first, train, at
 
 
 @njit(cache=True)

@@ -1,0 +1,98 @@
+"""Rows of the ways that matter at one instant: the edges under the bodies of trains, and the joins ahead of them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from trainctl.kernels import keep_by_sources
+from trainctl.signals import Bools, Floats, Ints
+from trainctl.topology.ways import Ways
+
+keep_by_sources()  # before anything below is decorated
+
+
+@njit(cache=True)
+def pieces(ways: Ways, row: Ints, s: Floats, length: Floats, present: Bools) -> tuple[Ints, Ints]:
+    """Find every edge a train's body is on.
+
+    Parameters
+    ----------
+    ways : Ways
+        Rows of all n trains.
+    row : ndarray, shape (n,)
+        Row in ``ways.edge`` of the edge the front is on; not read where the train is not present.
+    s : ndarray, shape (n,)
+        Front, from the beginning of the way [m].
+    length : ndarray, shape (n,)
+        Train lengths [m].
+    present : ndarray, shape (n,)
+        Who is on the net.
+
+    Returns
+    -------
+    train, at : ndarray, shape (P,)
+        Train and row of each, by train, from the front back.
+    """
+    count = 0
+    for again in range(2):
+        if again:
+            train, at = np.empty(count, np.int64), np.empty(count, np.int64)
+        count = 0
+        for i in range(len(row)):
+            if not present[i]:
+                continue
+            k = row[i]
+            while True:
+                if again:
+                    train[count], at[count] = i, k
+                count += 1
+                if k == ways.first[i] or ways.begin[k] <= s[i] - length[i]:
+                    break
+                k -= 1
+    return train, at
+
+
+@njit(cache=True)
+def approaches(ways: Ways, joins: Bools, row: Ints, s: Floats, present: Bools, horizon: float) -> tuple[Ints, Ints, Ints]:
+    """Find the joins ahead of every train.
+
+    Parameters
+    ----------
+    ways : Ways
+        Rows of all n trains.
+    joins : ndarray, shape (E,)
+        Edges that two or more edges lead into.
+    row : ndarray, shape (n,)
+        Row in ``ways.edge`` of the edge the front is on; not read where the train is not present.
+    s : ndarray, shape (n,)
+        Front, from the beginning of the way [m].
+    present : ndarray, shape (n,)
+        Who is on the net.
+    horizon : float
+        How far ahead is looked [m].
+
+    Returns
+    -------
+    first : ndarray, shape (n + 1,)
+        Those of train ``i`` are ``first[i]:first[i + 1]`` of what follows.
+    train, at : ndarray, shape (R,)
+        Train and row of each, by train, nearest first.
+    """
+    first = np.zeros(len(row) + 1, np.int64)
+    count = 0
+    for again in range(2):
+        if again:
+            train, at = np.empty(count, np.int64), np.empty(count, np.int64)
+        count = 0
+        for i in range(len(row)):
+            if present[i]:
+                for k in range(row[i] + 1, ways.first[i + 1]):
+                    if ways.begin[k] - s[i] > horizon:
+                        break
+                    if joins[ways.edge[k]]:
+                        if again:
+                            train[count], at[count] = i, k
+                        count += 1
+            first[i + 1] = count
+    return first, train, at
