@@ -222,6 +222,8 @@ def test_live_messages_are_those_of_this_instant() -> None:
     assert np.isfinite(rig.own).all()
 
 
+compiles = pytest.mark.skipif(bool(integrate.config.DISABLE_JIT), reason="NUMBA_DISABLE_JIT: nothing is compiled")
+
 REPORT = """
 import importlib.util, json, sys
 spec = importlib.util.spec_from_file_location("rig", sys.argv[1])
@@ -250,6 +252,7 @@ def test_interpreted_and_compiled_code_agree() -> None:
     assert np.abs(np.array(elsewhere("state", NUMBA_DISABLE_JIT="1")) - rig.own).max() < 1e-11
 
 
+@compiles
 def test_another_process_finds_everything_compiled() -> None:
     cruising()
     assert elsewhere("cache") == [0, 0, 0, 0]
@@ -259,6 +262,7 @@ def first_of(constants: Any) -> float:
     return constants[0]  # type: ignore[no-any-return]
 
 
+@compiles
 def test_a_law_that_is_gone_costs_nobody_else_anything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Types are kept by name: an index that names a module which cannot be imported any more is lost as a whole."""
     monkeypatch.setattr(integrate.config, "CACHE_DIR", str(tmp_path))
