@@ -23,6 +23,8 @@ UNITS = TYPE | {
     "coupler_damping_ns_per_m": 600.0,
 }  # fmt: skip
 
+EMU = '<vType id="emu" vClass="rail" length="100" maxSpeed="45"/>'
+
 #: What each law needs to run trains at 35 m/s, 1200 m apart.
 LAWS: dict[str, dict[str, Any]] = {
     "fully_distributed": {
@@ -90,14 +92,12 @@ def both_ways(name: str, begin: str, end: str, **more: Any) -> dict[str, Any]:
     return {name: (begin, end, said), f"-{name}": (end, begin, said)}
 
 
-def traffic(
-    folder: Path, body: str, types: str = '<vType id="emu" vClass="rail" length="100" maxSpeed="45"/>', end: int = 9000
-) -> None:
+def traffic(folder: Path, body: str, types: str = EMU, end: int = 9000, begin: int = 0) -> None:
     """Write ``a.rou.xml`` and ``a.sumocfg``."""
     (folder / "a.rou.xml").write_text(f"<routes>{types}{body}</routes>")
     (folder / "a.sumocfg").write_text(
         '<configuration><input><net-file value="a.net.xml"/><route-files value="a.rou.xml"/></input>'
-        f'<time><begin value="0"/><end value="{end}"/></time></configuration>'
+        f'<time><begin value="{begin}"/><end value="{end}"/></time></configuration>'
     )
 
 

@@ -17,6 +17,7 @@ from trainctl.scenario import Scenario, Train, TrainType
 from trainctl.scenario import Traffic as Driving
 from trainctl.signals import Bools, Floats, Ints
 from trainctl.traffic import Departure, Traffic, read_traffic, train_type
+from trainctl.traffic_kinds import Kind
 
 
 class Stop(NamedTuple):
@@ -90,16 +91,17 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         if not any(fnmatch.fnmatchcase(i, p) for i in ids)
     ]
     found += _events(scenario, ids, rails)
-    trains, routes, stops = [], [], []
+    trains, routes, stops, top_speed = [], [], [], []
     for d in traffic.departures:
         try:
             way = rails.way(d.edges)
+            begin = rails.start_m[way[0]] + np.concatenate([[0.0], np.cumsum(rails.length_m[way[:-1]])])
+            stops.append(_stops(d, rails, way, begin, traffic.begin_s))
         except ValueError as error:
             found.append(f"network.sumocfg: train {d.id}: {error}")
             continue
-        begin = rails.start_m[way[0]] + np.concatenate([[0.0], np.cumsum(rails.length_m[way[:-1]])])
         routes.append(tuple(rails.edges[e] for e in way.tolist()))
-        stops.append(_stops(d, rails, way, begin, traffic.begin_s))
+        top_speed.append(_top_speed(traffic.kinds[d.kind], rails.speed_mps[way]))
         trains.append(
             Train(
                 id=d.id, type=d.kind, track=d.edges[0], position_m=float(begin[0] + d.position_m),
@@ -115,7 +117,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         edge=np.array([rails.index[d.edges[0]] for d in departures], np.int64),
         lane_position=np.array([d.position_m for d in departures]),
         speed=np.array([math.nan if d.speed_mps is None else d.speed_mps for d in departures]),
-        top_speed=np.array([traffic.kinds[d.kind].max_speed_mps * traffic.kinds[d.kind].speed_factor for d in departures]),
+        top_speed=np.array(top_speed),
         routes=tuple(routes),
         stops=tuple(stops),
         cooperates=together,
@@ -154,11 +156,20 @@ def _types(scenario: Scenario, traffic: Traffic) -> tuple[dict[str, TrainType], 
 
 
 def _stops(departure: Departure, rails: Rails, way: Ints, begin: Floats, begin_s: float) -> tuple[Stop, ...]:
-    """Stops in the order of the way; one edge may be passed more than once."""
-    found, row = [], 0
+    """Stops in the order of the way; an edge that is passed more than once has those behind the last place on its next passage."""
+    found, row, last = [], 0, departure.position_m
     for stop in departure.stops:
-        ahead = np.flatnonzero(way[row:] == rails.index[stop.edge])
-        row += int(ahead[0])
+        edge = rails.index[stop.edge]
+        row += int(way[row] == edge and stop.position_m < last)
+        ahead = np.flatnonzero(way[row:] == edge)
+        if not len(ahead):
+            raise ValueError(f"stop on edge {stop.edge} at {stop.position_m:g} m: lies behind the departure or the stop before")
+        row, last = row + int(ahead[0]), stop.position_m
         until = -math.inf if stop.until_s is None else stop.until_s - begin_s
         found.append(Stop(float(begin[row] + stop.position_m), stop.duration_s, until, stop.name or stop.edge))
     return tuple(found)
+
+
+def _top_speed(kind: Kind, limits: Floats) -> float:
+    """Greatest speed of a train on a way of these limits. A speed factor above 1 has no effect: nobody is driven above a limit."""
+    return kind.max_speed_mps if kind.speed_factor >= 1.0 else min(kind.max_speed_mps, kind.speed_factor * float(limits.max()))

@@ -69,7 +69,7 @@ class Traffic(NamedTuple):
     notes: tuple[str, ...]  # what is not followed
 
 
-def read_traffic(sumocfg: Path, work: Path, end_s: float | None = None, seed: int = 42) -> Traffic:
+def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, seed: int = 42) -> Traffic:
     """What a SUMO configuration says of its trains.
 
     Parameters
@@ -78,8 +78,8 @@ def read_traffic(sumocfg: Path, work: Path, end_s: float | None = None, seed: in
         The configuration; the files it names lie relative to its folder.
     work : Path
         Folder for what ``duarouter`` reads and writes; made if it is not there.
-    end_s : float, optional
-        Departures from this time on are of no interest [s]; the configuration's own end holds as well.
+    duration_s : float, optional
+        Departures this long after the configuration's begin, or later, are of no interest [s]; its own end holds as well.
     seed : int
         Of all that is drawn: the same seed gives the same trains.
 
@@ -101,7 +101,7 @@ def read_traffic(sumocfg: Path, work: Path, end_s: float | None = None, seed: in
     if wrong:
         raise InputError(wrong)
     begin, own_end = times["begin"], times["end"] if times["end"] >= 0 else None
-    ends = [e for e in (own_end, end_s) if e is not None]
+    ends = [e for e in (own_end, None if duration_s is None else begin + duration_s) if e is not None]
     tracks = read_tracks(net[0])
     demand = read_demand([*more, *routes])
     wrong = [

@@ -217,7 +217,7 @@ def test_begin_and_end_bound_the_departures(files: Files) -> None:
     flow = '<flow id="f" type="t" begin="0" end="900" period="100" route="main"/>'
     assert [d.depart_s for d in files.read(flow, begin=200, end='<end value="500"/>').departures] == [200, 300, 400]
     files.write(flow)
-    assert [d.depart_s for d in read_traffic(files.sumocfg, files.folder / "work", end_s=250).departures] == [0, 100, 200]
+    assert [d.depart_s for d in read_traffic(files.sumocfg, files.folder / "work", duration_s=250).departures] == [0, 100, 200]
 
 
 def test_what_is_not_followed_is_told(files: Files) -> None:
