@@ -5,10 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from scenes import coupled_trains
 
 from trainctl.controllers import emu_finite_time as law
 from trainctl.controllers.emu_finite_time import Params, coupler_weight, train_weight
-from trainctl.signals import Bounds, Consists, Floats, Links, Reference, Scene
+from trainctl.signals import Floats, Reference, Scene
 
 COUPLER = (0.1, 0.1, 0.05, 0.03)  # h1, h2, delta1, delta2
 TRAINS = (3000.0, 1500.0, 10000.0, 1000.0, 600.0)  # ls, le, beta, gamma1, gamma2
@@ -16,28 +17,7 @@ TRAINS = (3000.0, 1500.0, 10000.0, 1000.0, 600.0)  # ls, le, beta, gamma1, gamma
 
 def scene(positions: tuple[float, ...] = (10e3, 6680.0, 3360.0), units: int = 4, **consist: Any) -> Scene:
     """Trains of four units in formation behind a leader at 10 km and 80 m/s; ``consist`` replaces fields of ``Consists``."""
-    trains = len(positions)
-    rows = trains * units
-    one, endless = np.ones(rows), np.full(rows, np.inf)
-    coupled = np.arange(1, rows + 1) % units != 0
-    consists = Consists(
-        np.arange(0, rows + 1, units), 80.0 * one, 8e4 * one, one.copy(), np.tile([0.01176, 7.7616e-4, 1.6e-5], (rows, 1)),
-        1.6e5 * coupled, 600.0 * coupled, endless, endless, endless, endless, endless,
-    )._replace(**consist)  # fmt: skip
-    pairs = [(j, i) for i in range(trains) for j in (i - 1, i + 1) if 0 <= j < trains]
-    sender, receiver = np.array(pairs, dtype=np.int64).reshape(-1, 2).T.copy()
-    spacing, some = 3000.0 + 80.0 * units, np.ones(len(pairs))
-    links = Links(
-        sender, receiver, np.searchsorted(receiver, np.arange(trains + 1)), (receiver - sender) * spacing, -np.inf * some,
-        np.inf * some, some, some > 0.0, -spacing * np.arange(trains), np.arange(trains),
-    )  # fmt: skip
-    own = np.empty((rows, 2))
-    own[:, 0] = np.repeat(positions, units) - 80.0 * np.tile(np.arange(units), trains)
-    own[:, 1] = 80.0
-    free = np.full(trains, np.inf)
-    reference = Reference(np.array([0.0, 1e4]), np.array([[10e3, 80.0]]))
-    names = [str(i + 1) for i in range(trains)]
-    return Scene(names, consists, own, links, Bounds(-free, free, -free, free), reference, 0.0, 1.0, 1.0, 0.5, 0.01)
+    return coupled_trains(positions, units, Reference(np.array([0.0, 1e4]), np.array([[10e3, 80.0]])), **consist)
 
 
 def accelerations(s: Scene, params: Params | None = None) -> Floats:

@@ -12,38 +12,20 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
+from scenes import coupled_trains
 
 from trainctl.controllers import emu_finite_time as law
 from trainctl.observers import none
 from trainctl.plants import coupled_units, integrate, shared
-from trainctl.signals import POWERS, Bounds, Consists, Floats, Links, Reference, Scene
+from trainctl.signals import POWERS, Floats, Reference, Scene
 
 JUMP = 0.0137  # s, where the reference below changes its speed: within a sub-step
 
 
-def scene(trains: int = 2, units: int = 3) -> Scene:
-    """Trains of light couplers and no limits, 3000 m apart, behind a leader whose speed jumps."""
-    rows = trains * units
-    one, endless = np.ones(rows), np.full(rows, np.inf)
-    coupled = np.arange(1, rows + 1) % units != 0
-    consists = Consists(
-        np.arange(0, rows + 1, units), 80.0 * one, 8e4 * one, one.copy(), np.tile([0.01176, 7.7616e-4, 1.6e-5], (rows, 1)),
-        1.6e5 * coupled, 600.0 * coupled, endless, endless, endless, endless, endless,
-    )  # fmt: skip
-    pairs = [(j, i) for i in range(trains) for j in (i - 1, i + 1) if 0 <= j < trains]
-    sender, receiver = np.array(pairs, dtype=np.int64).reshape(-1, 2).T.copy()
-    spacing, some = 3000.0 + 80.0 * units, np.ones(len(pairs))
-    links = Links(
-        sender, receiver, np.searchsorted(receiver, np.arange(trains + 1)), (receiver - sender) * spacing, -np.inf * some,
-        np.inf * some, some, some > 0.0, -spacing * np.arange(trains), np.arange(trains),
-    )  # fmt: skip
-    own = np.empty((rows, 2))
-    own[:, 0] = 10e3 - np.repeat(spacing * np.arange(trains), units) - 80.0 * np.tile(np.arange(units), trains)
-    own[:, 1] = 80.0
+def scene() -> Scene:
+    """Two trains of three units in formation behind a leader whose speed jumps."""
     reference = Reference(np.array([0.0, JUMP, 1e4]), np.array([[10e3, 80.0], [10e3 + 80.0 * JUMP, 85.0]]))
-    free = np.full(trains, np.inf)
-    names = [str(i) for i in range(trains)]
-    return Scene(names, consists, own, links, Bounds(-free, free, -free, free), reference, 0.0, 1.0, 1.0, 0.5, 0.01)
+    return coupled_trains((10e3, 6760.0), 3, reference)
 
 
 class Rig:
@@ -242,7 +224,8 @@ else:
 def elsewhere(what: str, **environment: str) -> Any:
     """Run ``REPORT`` in a process of its own."""
     command = [sys.executable, "-c", REPORT, __file__, what]
-    done = subprocess.run(command, env={**os.environ, **environment}, capture_output=True, text=True, check=True)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     return json.loads(done.stdout)
 
 
