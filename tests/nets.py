@@ -8,10 +8,13 @@ from __future__ import annotations
 import copy
 import random
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+from sumo_net import LineError
 from sumo_net.build import program
 
 #: A train that can brake and pull with some 1 m/s2.
@@ -138,6 +141,32 @@ HILLY = {
         {"id": "on", "from": "right", "to": "left", "position_m": 6200.823456, "length_m": 200.0, "speed_mps": 40.0},
     ],
 }  # fmt: skip
+
+
+#: What is in a file that is no rail net -> what is told of it, whoever reads it; None: there is no file.
+NO_NETS = [
+    (None, "no such net file"),
+    ("", "not XML: no element found"),
+    ("name = 1", "not XML: "),
+    ("<net><edge></net>", "not XML: mismatched tag"),
+    ("<routes/>", "not a SUMO net: its root element is <routes>, not <net>"),
+    ("<net/>", "has no rail edges"),
+    ('<net><edge id="e"><lane id="e_0" length="5" speed="9" shape="0,0 5,0"/></edge></net>', "has no rail edges"),
+    ('<net><edge id="e"><lane id="e_0" allow="bus bicycle"/></edge></net>', "has no rail edges"),
+    ('<net><edge id=":e" function="internal"><lane allow="rail"/></edge></net>', "has no rail edges"),
+    ('<!DOCTYPE net [<!ENTITY a "aa"><!ENTITY b "&a;&a;">]><net>&b;</net>', "not a SUMO net: it declares XML entities"),
+]
+
+
+def refused(read: Callable[[Path], Any], path: Path, content: str | None) -> str:
+    """The one line with which a file of this content is refused, without the path it begins with."""
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(LineError) as caught:
+        read(path)
+    (line,) = caught.value.mistakes
+    assert line.startswith(f"{path}: ")
+    return line.removeprefix(f"{path}: ")
 
 
 # Nets
