@@ -22,8 +22,11 @@ SUMO are those of a run (``trainctl.sumo.session.OPTIONS``) in all cases with SU
 until the logs are closed, per train and step [us]; ``peak_mb`` is the peak resident memory of the process that steps. Time of the
 processor is told too (``cpu_``, all threads): where others use the machine it is the truer figure.
 
+``sparse`` is compared with the bare step that writes FCD in every step. CPU times of ``traci`` and ``client`` hold SUMO's start.
+
 ``--instructions`` counts instead of measuring: instructions per train and step, by valgrind, which must be installed. They are no
 times (a cache miss is not seen), but the same whatever else the machine does: they tell whether a change made anything cheaper.
+Nothing is closed, and SUMO behind TraCI is not counted.
 """
 
 from __future__ import annotations

@@ -13,14 +13,27 @@ from pathlib import Path
 from typing import Any
 
 import numba
+from numba.core import caching
 
 config: Any = numba.config
+Index: Any = caching.IndexDataCacheFile
 
 #: ``njit`` without numba's run time, its allocation and reference counts, for what is called in every Runge-Kutta stage.
 bare: Any = partial(numba.njit, cache=True, _nrt=False)
 
 #: The same for the functions of laws, observers and plants, with numpy's rules of division: put into the stage that calls them.
 inlined: Any = partial(bare, error_model="numpy", forceinline=True)
+
+
+def _load_index(file: Any, load: Any = Index._load_index) -> Any:
+    """An index of compiled code names types; where one of them is no longer to be found, numba would fail for ever."""
+    try:
+        return load(file)
+    except (ImportError, AttributeError):
+        return {}
+
+
+Index._load_index = _load_index
 
 
 def keep_by_sources() -> None:

@@ -7,6 +7,7 @@ import importlib
 import importlib.metadata
 import importlib.util
 import pkgutil
+import re
 import sys
 import traceback
 from functools import partial
@@ -61,13 +62,23 @@ def find_law(name: str, folder: Path = Path()) -> Any:
 
 
 def _law_file(file: Path) -> Any:
-    """A law's file as a module, read anew each time; another file of the same name is another module."""
-    name = f"trainctl_law_{file.stem}_{hashlib.sha256(str(file.resolve()).encode()).hexdigest()[:16]}"
-    spec = importlib.util.spec_from_file_location(name, file.resolve())
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
+    """A law's file as a module with its text as ``SOURCE``; the same module as before if that has not changed."""
+    place, source = file.resolve(), file.read_bytes()
+    digest = hashlib.sha256(str(place).encode()).hexdigest()[:16]  # another file of the same name is another module
+    name = re.sub(r"\W", "_", f"trainctl_law_{file.stem}_{digest}")
+    known = sys.modules.get(name)
+    if known is not None and source == known.SOURCE:
+        return known
+    spec = importlib.util.spec_from_file_location(name, place)
+    assert spec is not None
+    module: Any = importlib.util.module_from_spec(spec)
+    module.SOURCE = source
     sys.modules[name] = module  # pydantic looks annotations up there
-    spec.loader.exec_module(module)
+    try:
+        exec(compile(source, place, "exec"), module.__dict__)
+    except BaseException:
+        del sys.modules[name]
+        raise
     return module
 
 

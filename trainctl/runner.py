@@ -305,7 +305,7 @@ def _stops() -> Iterator[_Stop]:
 def keep_law(p: Prepared, folder: Path) -> None:
     """A law that came as a file stands beside the scenario that names it."""
     if p.scenario.controller.law.endswith(".py"):
-        shutil.copyfile(p.law.__file__, folder / p.scenario.controller.law)
+        (folder / p.scenario.controller.law).write_bytes(p.law.SOURCE)
 
 
 def begin(partial: Path, p: Prepared, every_s: float | None) -> None:

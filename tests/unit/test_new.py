@@ -19,6 +19,7 @@ from trainctl.laws import find_law
 from trainctl.new import controller
 from trainctl.plants.integrate import described, part
 from trainctl.prepare import open_scenario
+from trainctl.runner import keep_law
 
 BIN = Path(sys.executable).parent / "trainctl"
 
@@ -123,17 +124,39 @@ def test_a_law_offered_by_a_package_must_be_a_module(monkeypatch):
 
 
 def test_a_law_read_again_is_not_mixed_with_the_one_before(tmp_path):
-    """Kernels are compiled of what the names of modules stand for, and cached by what stands in their files."""
+    """Kernels are compiled of what the names of modules stand for, and cached by the text these were made of."""
     source = Path(emu_finite_time.__file__).read_text()
     for folder in ("here", "there"):
         (tmp_path / folder).mkdir()
-        (tmp_path / folder / "mine.py").write_text(source)
-    here, there = (find_law("mine.py", tmp_path / folder) for folder in ("here", "there"))
+        (tmp_path / folder / "my law.py").write_text(source)
+    here, there = (find_law("my law.py", tmp_path / folder) for folder in ("here", "there"))
     assert part(described(here), 0, "demand") is here.demand
     assert part(described(there), 0, "demand") is there.demand
-    before = described(here)
-    (tmp_path / "here" / "mine.py").write_text(source + "\n")
-    again = find_law("mine.py", tmp_path / "here")
+    assert find_law("my law.py", tmp_path / "here") is here
+    (tmp_path / "here" / "my law.py").write_text(source + "\n")
+    again, before = find_law("my law.py", tmp_path / "here"), described(here)
+    (tmp_path / "here" / "my law.py").unlink()
     assert described(again) != before
-    with pytest.raises(LawError, match=r"mine\.py: was read again since this scenario was opened"):
-        described(here)
+    (tmp_path / "there" / "my law.py").write_text(source + "\n")
+    described.cache_clear()
+    find_law("my law.py", tmp_path / "there")
+    with pytest.raises(LawError, match=r"my law\.py: was read again since this scenario was opened"):
+        described(there)
+
+
+def test_a_law_that_cannot_be_read_is_not_taken_for_known(tmp_path):
+    (tmp_path / "odd.py").write_text('CLOCK = "sampled"\nraise ValueError("not yet")\n')
+    for _ in range(2):
+        with pytest.raises(InputError, match="ValueError: not yet"):
+            find_law("odd.py", tmp_path)
+
+
+def test_a_run_keeps_the_law_that_ran(tmp_path):
+    """Whatever the file says by then."""
+    controller("mine", tmp_path)
+    prepared = open_scenario(str(tmp_path / "mine.toml"))
+    law = tmp_path / "mine.py"
+    source = law.read_bytes()
+    law.write_text("changed")
+    keep_law(prepared, tmp_path)
+    assert law.read_bytes() == source

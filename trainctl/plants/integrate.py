@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import hashlib
 import sys
+import threading
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +30,9 @@ config: Any = numba.config
 
 #: Whose function ``part`` finds.
 LAW, OBSERVER, PLANT = range(3)
+
+#: Held while numba's settings are those of one law.
+COMPILING = threading.Lock()
 
 #: Trains integrated together where they do not hear each other: few enough for the second cache, enough to share the calls.
 TOGETHER = 64
@@ -332,13 +337,14 @@ def part_compiled(code, owner, name):  # type: ignore[no-untyped-def]
     return lambda code, owner, name: function
 
 
+@cache
 def described(*modules: Any) -> str:
-    """Names of these modules, then digests of their files: kernels are compiled for, and cached by, this text."""
+    """Names of these modules, then digests of their text: kernels are compiled for, and cached by, this."""
     for module in modules:
         if sys.modules.get(module.__name__) is not module:
             raise LawError(f"{module.__file__}: was read again since this scenario was opened: open it again")
-    digests = (hashlib.sha256(Path(module.__file__).read_bytes()).hexdigest()[:16] for module in modules)
-    return " ".join([*(module.__name__ for module in modules), *digests])
+    sources = (getattr(module, "SOURCE", None) or Path(module.__file__).read_bytes() for module in modules)
+    return " ".join([*(module.__name__ for module in modules), *(hashlib.sha256(s).hexdigest()[:16] for s in sources)])
 
 
 def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...]) -> Parts:
@@ -363,15 +369,13 @@ def from_cache(kernel: Any, place: str, arguments: tuple[Any, ...]) -> Callable[
 
     One folder per law, observer and plant: an index names the types of laws, and none of it can be read where one of them is gone.
     """
-    kept, config.CACHE_DIR = config.CACHE_DIR, str(Path(config.CACHE_DIR) / place)
-    try:
-        kernel.enable_caching()
-        return kernel.compile(arguments)  # type: ignore[no-any-return]
-    except (ImportError, AttributeError):  # what this law took from elsewhere is no longer there
-        kernel._cache.flush()
-        return kernel.compile(arguments)  # type: ignore[no-any-return]
-    finally:
-        config.CACHE_DIR = kept
+    with COMPILING:
+        kept, config.CACHE_DIR = config.CACHE_DIR, str(Path(config.CACHE_DIR) / place)
+        try:
+            kernel.enable_caching()
+            return kernel.compile(arguments)  # type: ignore[no-any-return]
+        finally:
+            config.CACHE_DIR = kept
 
 
 def advance(

@@ -122,7 +122,7 @@ def write_configuration(
 
 def fcd_period(every: float | None) -> dict[str, str]:
     """Options for an FCD log with rows every so often [s]; every step if None."""
-    return {} if every is None else {"device.fcd.period": f"{every:g}"}
+    return {} if every is None else {"device.fcd.period": f"{every:.3f}"}
 
 
 def messages(log: Path) -> list[tuple[float | None, str]]:
