@@ -57,7 +57,7 @@ SPEED_MPS = 80.0
 SPACING_M = dict.fromkeys((*IN_SUMO, *NUMERIC), 500.0) | {"finite_time": 900.0, "actuated_units": 900.0}
 
 #: Train-steps of one repeat, about; the slower a case, the fewer.
-WORK = {"traci": 15_000, "client": 10_000, "coupled_units": 45_000, "finite_time": 30_000, "actuated_units": 15_000}
+WORK = {"traci": 15_000, "client": 10_000, "coupled_units": 30_000, "finite_time": 20_000, "actuated_units": 9_000}
 IN_SUMO_WORK = 120_000
 
 #: Steps of the two runs whose instructions are compared; in between, the recorder writes at 1000 trains what 66 steps hold.
