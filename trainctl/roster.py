@@ -16,8 +16,8 @@ from trainctl.errors import InputError
 from trainctl.scenario import Scenario, Train, TrainType
 from trainctl.scenario import Traffic as Driving
 from trainctl.signals import Bools, Floats, Ints
-from trainctl.traffic import Departure, Traffic, read_traffic, train_type
-from trainctl.traffic_kinds import Kind
+from trainctl.traffic import Departure, Traffic, read_traffic
+from trainctl.traffic_kinds import Kind, train_type
 
 
 class Stop(NamedTuple):

@@ -18,16 +18,8 @@ def pieces(ways: Ways, row: Ints, s: Floats, length: Floats, present: Bools) -> 
 
     Parameters
     ----------
-    ways : Ways
-        Rows of all n trains.
-    row : ndarray, shape (n,)
-        Row in ``ways.edge`` of the edge the front is on; not read where the train is not present.
-    s : ndarray, shape (n,)
-        Front, from the beginning of the way [m].
-    length : ndarray, shape (n,)
-        Train lengths [m].
-    present : ndarray, shape (n,)
-        Who is on the net.
+    ways, row, s, length, present
+        As of ``along.places``.
 
     Returns
     -------
@@ -59,18 +51,10 @@ def approaches(ways: Ways, joins: Bools, row: Ints, s: Floats, present: Bools, h
 
     Parameters
     ----------
-    ways : Ways
-        Rows of all n trains.
     joins : ndarray, shape (E,)
         Edges that two or more edges lead into.
-    row : ndarray, shape (n,)
-        Row in ``ways.edge`` of the edge the front is on; not read where the train is not present.
-    s : ndarray, shape (n,)
-        Front, from the beginning of the way [m].
-    present : ndarray, shape (n,)
-        Who is on the net.
-    horizon : float
-        How far ahead is looked [m].
+    ways, row, s, present, horizon
+        As of ``along.places``.
 
     Returns
     -------
