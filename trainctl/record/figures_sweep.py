@@ -32,6 +32,8 @@ ROUNDING = 1e-6
 def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
     """Draw the complete runs over the first setting that is a number and varies, or else in order of size; broken bounds in red.
 
+    Runs that gave nothing are counted in the title: what they would have shown may differ from the rest.
+
     Parameters
     ----------
     frame : DataFrame
@@ -42,6 +44,8 @@ def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
         Picture file.
     """
     done = frame[frame["status"] == "complete"]
+    missing = frame["status"].value_counts().drop("complete", errors="ignore").sort_index()
+    runs = f"{len(done)} of {len(frame)} runs complete, {', '.join(f'{n} {status}' for status, n in missing.items())}"
     shown = [key for key in SHOWN if key in done.columns and np.isfinite(done[key].to_numpy(float)).any()]
     axis = next((k for k in parameters if k != "run.seed" and done[k].dtype.kind in "if" and done[k].nunique() > 1), None)
     broken = done["violations"].to_numpy(float) > 0
@@ -66,6 +70,7 @@ def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
             if key.startswith("bounds."):
                 panel.axhline(0.0, color="black", linestyle="--", linewidth=0.6)
             panel.set_ylabel(SHOWN[key])
+        axes[0].set_title(runs if len(missing) else f"all {len(frame)} runs", loc="left")
         axes[-1].set_xlabel("runs in order of size" if axis is None else axis)
         figure.align_ylabels(axes)
         style.legend(figure, "double")
