@@ -104,7 +104,7 @@ class Units:
         self.hilly = bool(len(self.gradient)) or (guided and bool(p.rails.slope.any()))
         ordered = guided or p.supervision.mode != "off"
         self.orders = integrate.Orders(
-            force=np.full(len(p.own) if ordered and not p.sampled else 0, np.nan),
+            held=shared.constants(p.plant_params, p.consists, self.gradient) if ordered and not p.sampled else shared.NOBODY,
             lift=np.zeros(len(p.own) if self.hilly and not p.sampled else 0),
             pace=np.zeros((len(self.masses) if guided else 0, 3)),
             since=0.0,
@@ -146,15 +146,15 @@ class Units:
     ) -> tuple[Floats, Motion]:  # fmt: skip
         """Integrate over one simulator step; the displacement is that of the heads.
 
-        Trains with an ``ordered`` (n,) acceleration, not NaN, get the forces for it instead of the law's. ``pace`` (4, n) is where
+        Trains with an ``ordered`` (n,) acceleration, not NaN, hold that instead of what their law demands. ``pace`` (4, n) is where
         each train's own reference is now, where they have one.
         """
         assert links is not None
         p, first, heads = self.p, self.p.consists.first, self.p.heads
         if p.sampled:
             self.loop.law.acceleration[:] = np.where(np.isnan(ordered), demand.acceleration, ordered)
-        elif len(self.orders.force):
-            self.orders.force[:] = self._forces(own, np.repeat(ordered, np.diff(first)))
+        elif len(self.orders.held.acceleration):
+            self.orders.held.acceleration[:] = ordered
         if len(self.orders.lift):
             self.orders.lift[:] = p.consists.mass * self._climbing(own)
         if pace is not None and len(self.orders.pace):
@@ -187,12 +187,6 @@ class Units:
             limited=self.extremes.limited > limited, clipped=clipped, force=force, extras=extras,
         )  # fmt: skip
 
-    def _forces(self, own: Floats, acceleration: Floats) -> Floats:
-        """Unit forces for these accelerations [N], (U,): every unit carries its own mass, resistance and weight."""
-        c, v = self.p.consists, own[:, SPEED]
-        per_mass = c.rotating * acceleration + np.where(v > 0.0, c.davis[:, 0] + (c.davis[:, 1] + c.davis[:, 2] * v) * v, 0.0)
-        return np.asarray(c.mass * (per_mass + self._climbing(own)))
-
     def _climbing(self, own: Floats) -> Floats:
         """Weight along the track per mass [N/kg], (U,)."""
         force: Floats = point.climbing(own[:, POSITION], self.gradient) + GRAVITY * self.plant.units[:, coupled_units.SLOPE]
@@ -203,6 +197,8 @@ class Units:
         self.plant.units[:, coupled_units.SLOPE] = slope
         if self.p.sampled:
             self.loop.law.units[:, coupled_units.SLOPE] = slope
+        elif len(self.orders.held.acceleration):
+            self.orders.held.units[:, coupled_units.SLOPE] = slope
 
     def saved(self) -> Any:
         """What a step changes here, to try one."""

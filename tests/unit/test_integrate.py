@@ -84,6 +84,30 @@ def test_a_held_acceleration_moves_the_head_exactly() -> None:
         assert moved[:, 1] == pytest.approx(0.37 * 8.0, abs=1e-11)
 
 
+def ordered(acceleration: tuple[float, float]) -> Rig:
+    """The finite-time law, where trains are told what acceleration to hold: NaN leaves them to their law."""
+    rig = cruising(live=False)  # else the other would hear of it
+    held = shared.constants(coupled_units.Params(), rig.scene.consists)
+    held.acceleration[:] = acceleration
+    rig.loop = rig.loop._replace(orders=integrate.NO_ORDERS._replace(held=held))
+    return rig
+
+
+def test_an_ordered_train_moves_as_under_a_train_level_law() -> None:
+    """Its couplers, too: they come to rest. The other train does what its law says."""
+    told, left, shares = ordered((-0.4, np.nan)), cruising(live=False), holding(-0.4)
+    for rig in (told, left, shares):
+        rig.own[1, 0] += 0.05
+        for t in range(6):
+            rig.advance(float(t), 0.01, 100)
+    assert (told.own[:3] == shares.own[:3]).all()
+    assert (told.own[3:] == left.own[3:]).all()
+    stretch = told.own[:2, 0] - told.own[1:3, 0] - told.scene.consists.length[:2]
+    assert np.abs(stretch).max() < 1e-4
+    assert told.extremes.coupler_min[:2].min() > -0.0501
+    assert told.extremes.coupler_max[:2].max() < 0.0501
+
+
 def test_it_is_of_fourth_order() -> None:
     errors = []
     for n in (10, 20, 400):

@@ -54,7 +54,7 @@ from trainctl.plants.coupled_units import (
 )
 from trainctl.plants.faults import Fault, Faults, effectiveness, fault_rate, tabulated
 from trainctl.plants.faults import violations as fault_violations
-from trainctl.signals import FORCE, GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Scene, Table
+from trainctl.signals import FORCE, GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Scene
 
 STATES = 3
 
@@ -62,8 +62,8 @@ STATES = 3
 RATE, NOISE = SLOPE + 1, SLOPE + 2
 
 
-class Params(Table):
-    """Keys of ``[plant]`` with ``kind = "actuated_units"``."""
+class Params(coupled_units.Params):
+    """Keys of ``[plant]`` with ``kind = "actuated_units"``, beside those of ``coupled_units``."""
 
     noise_variance_m2_per_s6: float = Field(
         0.0, ge=0, description="Variance of Gaussian noise in the jerk of every unit [m2/s6]; 0.5 in the paper, needs [run] seed."
@@ -113,7 +113,7 @@ def constants(
     trains : sequence of str
         Ids that the faults name, in the order of ``consists``.
     """
-    first, units, slopes = coupled_units.constants(coupled_units.Params(), consists, gradient, resistance_factor)
+    first, units, slopes = coupled_units.constants(params, consists, gradient, resistance_factor)
     units = np.column_stack([units, consists.actuator_rate, np.zeros(len(units))])
     return Constants(first, np.ascontiguousarray(units), slopes, tabulated(faults, trains, consists))
 

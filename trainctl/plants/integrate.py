@@ -22,6 +22,7 @@ from numba.extending import overload
 
 from trainctl.errors import LawError
 from trainctl.kernels import bare
+from trainctl.plants import shared
 from trainctl.signals import FORCE, POWERS, Floats, Ints, Links, Reference, leader_at
 
 types: Any = numba.types
@@ -49,10 +50,14 @@ class Parts(NamedTuple):
 class Orders(NamedTuple):
     """What is ordered from outside of the law over one simulator step. Arrays of length 0 order nothing."""
 
-    force: Floats  # (U,) N, instead of the law's demand; NaN leaves a train to its law
+    held: shared.Constants  # accelerations (n,) held instead of the law's demand; NaN leaves a train to its law
     lift: Floats  # (U,) N, what holds each unit on its slope: added to the law's demand
     pace: Floats  # (n, 3) position [m], speed [m/s] and acceleration [m/s2] at ``since`` of each train's own reference
     since: float  # s
+
+
+#: Nothing is ordered.
+NO_ORDERS = Orders(shared.NOBODY, np.zeros(0), np.zeros((0, 3)), 0.0)
 
 
 class Loop(NamedTuple):
@@ -61,7 +66,7 @@ class Loop(NamedTuple):
     law: Any
     observer: Any
     plant: Any
-    orders: Orders = Orders(np.zeros(0), np.zeros(0), np.zeros((0, 3)), 0.0)
+    orders: Orders = NO_ORDERS
 
 
 class Air(NamedTuple):
@@ -135,16 +140,6 @@ def lead(i, orders, t, leader):  # type: ignore[no-untyped-def]
 
 
 @bare()
-def follow(force, lift, a, b, applied):  # type: ignore[no-untyped-def]
-    """Put the forces that are ordered, or the lift, where units ``a`` to ``b`` have the law's demand."""
-    if len(force) > 0 and force[a] == force[a]:  # not NaN
-        for u in range(a, b):
-            applied[u] = force[u]
-    else:
-        add(lift, 1.0, a, b, applied)
-
-
-@bare()
 def add(lift, sign, a, b, applied):  # type: ignore[no-untyped-def]
     """Add ``sign`` times the lift, if there is one, to the forces of units ``a`` to ``b``."""
     if len(lift) > 0:
@@ -165,8 +160,8 @@ def stage(code, loop, first, links, reference, air, t, inside, own, estimate, wo
     observed = estimate.shape[1] > 0
     leader_at(reference, t, inside, work.leader)
     age = 0.0 if air.live else t - air.sent_at
-    lift, talk = loop.orders.lift, talking(air)
-    ordered, guided = len(loop.orders.force) > 0 or len(lift) > 0, len(loop.orders.pace) > 0
+    held, lift, talk = loop.orders.held.acceleration, loop.orders.lift, talking(air)
+    ordered, guided = len(held) > 0, len(loop.orders.pace) > 0
     for i in range(low, high):
         a, b = first[i], first[i + 1]
         if observed:
@@ -189,17 +184,20 @@ def stage(code, loop, first, links, reference, air, t, inside, own, estimate, wo
             i, loop.law, work.leader, age, links.slot[i], own[a:b], estimate[a:b], work.correction[a:b],
             links.desired[e:f], air.heard[e:f], work.applied[a:b],
         )  # fmt: skip
-        if ordered:
-            follow(loop.orders.force, lift, a, b, work.applied)
+        if ordered and held[i] == held[i]:  # not NaN
+            shared.demand(
+                i, loop.orders.held, work.leader, age, 0.0, own[a:b], estimate[a:b], work.correction[a:b], links.desired[e:f],
+                air.heard[e:f], work.applied[a:b],
+            )  # fmt: skip
+        else:
+            add(lift, 1.0, a, b, work.applied)
         work.limited[i] = 1.0 if limit(i, loop.plant, own[a:b], work.applied[a:b]) else 0.0
         if observed:
-            if ordered:
-                add(lift, -1.0, a, b, work.applied)
+            add(lift, -1.0, a, b, work.applied)
             estimate_rate(
                 i, loop.observer, own[a:b], estimate[a:b], work.correction[a:b], work.applied[a:b], work.estimate_rate[a:b]
             )  # fmt: skip
-            if ordered:
-                add(lift, 1.0, a, b, work.applied)
+            add(lift, 1.0, a, b, work.applied)
         if talk and air.chain:
             message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
         rate(i, loop.plant, t, inside, own[a:b], work.applied[a:b], work.own_rate[a:b], work.power[i])

@@ -2,7 +2,7 @@
 
 Every unit carries its own mass's share, so couplers at rest stay at rest and the head moves exactly ``v T + a T**2 / 2``. What a
 coupler carries beyond that is damped by pairs of forces that cancel within the train. The functions have the shape of a continuous
-law, to be integrated with ``plants.coupled_units``.
+law, to be integrated with ``plants.coupled_units``; they also serve trains that the supervisor, or a driver, takes from such a law.
 
 Symbols
 -------
@@ -55,6 +55,10 @@ class Constants(NamedTuple):
     acceleration: Floats  # (n,) m/s2, overwritten once per control period
     stiffness: float  # 1/s2
     damping: float  # 1/s
+
+
+#: No train.
+NOBODY = Constants(np.zeros(1, dtype=np.int64), np.zeros((0, SLOPE + 1)), np.zeros((0, 2)), np.zeros(0), 0.0, 0.0)
 
 
 def constants(params: coupled_units.Params, consists: Consists, gradient: Floats | None = None) -> Constants:
