@@ -7,6 +7,7 @@ repeated with new processes, and medians are told: of times, and of ratios withi
 
 =================  ===============================================================================================================
 bare               SUMO stepping the trains, each at the constant commanded speed it starts with
+idle               the same, with SUMO's drivers as a run has them: they decide nothing but how to pass the end of an edge
 rail               SUMO's own ``Rail`` model drives the same trains on the same net
 loop               ours: ``fully_distributed`` on point trains, everything recorded
 sparse             the loop with rows, and SUMO's FCD, every 10 s only: what large networks may do with
@@ -47,12 +48,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 SIZES = (10, 100, 1000, 10_000)
-IN_SUMO = ("bare", "rail", "loop", "sparse", "traci", "client")
-ALONE = ("bare", "rail", "client")  # without our loop
+IN_SUMO = ("bare", "idle", "rail", "loop", "sparse", "traci", "client")
+ALONE = ("bare", "idle", "rail", "client")  # without our loop
 NUMERIC = ("coupled_units", "finite_time", "actuated_units")
 #: Compared to a few per cent; through TraCI everything is many times slower, which one repeat tells.
-REPEATED = ("bare", "rail", "loop", "sparse")
+REPEATED = ("bare", "idle", "rail", "loop", "sparse")
 PARTS = ("read", "topology", "control", "plant", "write", "step", "record")
+EDGE_M = 5000.0
 SPEED_MPS = 80.0
 SPACING_M = dict.fromkeys((*IN_SUMO, *NUMERIC), 500.0) | {"finite_time": 900.0, "actuated_units": 900.0}
 
@@ -84,7 +86,7 @@ def scenario(case: str, trains: int, steps: int) -> tuple[str, str]:
     front = 1000.0 + (trains if slots else rows) * spacing
     line = (
         f'name = "bench_three_tracks"\ntracks = [2, 1, 3]\nlength_m = {front + 100.0 * (steps + 2) + 5000.0}\nstart_m = 0.0\n'
-        "max_edge_m = 5000.0\nspeed = [[0.0, 100.0]]\n"
+        f"max_edge_m = {EDGE_M}\nspeed = [[0.0, 100.0]]\n"
     )
     body = [
         'schema_version = 1\ntitle = "Bench"',
@@ -265,17 +267,21 @@ class Case(NamedTuple):
 
 
 def alone(folder: Path, case: str) -> Case:
-    """SUMO without a loop: bare or rail."""
+    """SUMO without a loop: bare, idle or rail."""
     import libsumo
+    import numpy as np
+
+    from trainctl.sumo.session import IDLE_S, PLANNED_M, silent
 
     libsumo.start(json.loads((folder / "command.json").read_text(encoding="utf-8")))
     libsumo.simulationStep()
-    names, clock = libsumo.vehicle.getIDList(), Clock()
-    if case == "bare":
+    vehicle, names, clock = libsumo.vehicle, libsumo.vehicle.getIDList(), Clock()
+    place, speed = (np.array([get(name) for name in names]) for get in (vehicle.getLanePosition, vehicle.getSpeed))
+    if case != "rail":
         for name in names:
-            libsumo.vehicle.setSpeedMode(name, 32)
-            libsumo.vehicle.setLaneChangeMode(name, 0)
-            libsumo.vehicle.setSpeed(name, libsumo.vehicle.getSpeed(name))
+            vehicle.setSpeedMode(name, 32)
+            vehicle.setLaneChangeMode(name, 0)
+            vehicle.setSpeed(name, vehicle.getSpeed(name))
     clock.around(libsumo, "close", "step")
     step = libsumo.simulationStep  # without the clock: what is compared with must not pay for it
 
@@ -283,7 +289,18 @@ def alone(folder: Path, case: str) -> Case:
         with clock.part("step"):
             step()
 
-    return Case(len(names), timed, libsumo.close, clock)
+    def idle() -> None:
+        place[:] += speed
+        with clock.part("step"):
+            for i in np.flatnonzero(place > EDGE_M - PLANNED_M).tolist():
+                vehicle.setActionStepLength(names[i], 0.0)
+            step()
+        place[place > EDGE_M] -= EDGE_M
+
+    if case == "idle":
+        with silent():
+            libsumo.vehicletype.setActionStepLength(vehicle.getTypeID(names[0]), IDLE_S)
+    return Case(len(names), idle if case == "idle" else timed, libsumo.close, clock)
 
 
 def client(folder: Path) -> Case:
@@ -357,7 +374,8 @@ def through_traci() -> Any:
     from sumo import SUMO_HOME
 
     shim: Any = types.ModuleType("libsumo")
-    shim.vehicle, shim.TraCIException, shim.FatalTraCIError = traci.vehicle, traci.TraCIException, traci.FatalTraCIError
+    shim.vehicle, shim.vehicletype = traci.vehicle, traci.vehicletype
+    shim.TraCIException, shim.FatalTraCIError = traci.TraCIException, traci.FatalTraCIError
 
     class Domain:
         def __getattr__(self, name: str) -> Any:

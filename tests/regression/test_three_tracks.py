@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import nets
 import numpy as np
 import pandas as pd
 import pytest
+import tomli_w
+
+from trainctl.prepare import open_scenario
+from trainctl.record.diff import EXACT, diff
+from trainctl.runner import run
+from trainctl.sumo.session import Sumo
 
 FULLY_DISTRIBUTED = [
     "fully_distributed",
@@ -53,6 +60,21 @@ def test_rows_every_ten_seconds_are_those_of_every_step(finished, typed, tmp_pat
         extremes = [c for c in b if c.endswith("_j")]  # energies since the last row
         kept = a[a[time].isin(b[time])].drop(columns=extremes).reset_index(drop=True)
         pd.testing.assert_frame_equal(kept, b.drop(columns=extremes).reset_index(drop=True))
+
+
+def test_drivers_of_sumo_who_decide_nothing_change_no_log(finished, monkeypatch, tmp_path, capfd):
+    """All they would decide is overruled: what SUMO writes is the same to the last bit, on lines and where trains come and go."""
+    nets.three_joins(tmp_path)
+    (tmp_path / "joins.toml").write_text(tomli_w.dumps(nets.scenario("robust_constrained", 1200)))
+    for name, duration in (("three_tracks", 1100), (str(tmp_path / "joins.toml"), 1200)):
+        idle = finished(name, **{"run.duration_s": duration})
+        with monkeypatch.context() as patch:
+            patch.setattr(Sumo, "idle", False)
+            planning = run(open_scenario(name, {"run.duration_s": duration}), tmp_path / f"planning_{duration}", "sumo")
+        report = diff(planning.folder, idle.folder, EXACT)
+        assert report.lines() == []
+        assert {"fcd", "tripinfo", "summary", "statistics", "collisions", "vehroute"} <= {t.table for t in report.tables}
+    assert capfd.readouterr().err == ""  # SUMO's remarks on such drivers concern nobody
 
 
 def test_nothing_but_the_plant_moved_a_train(finished):

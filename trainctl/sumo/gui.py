@@ -74,6 +74,7 @@ class Gui(Sumo):
     """
 
     api: Any = traci
+    idle = False  # fast enough to be looked at, and SUMO's window would show its warnings
 
     def __init__(
         self, line: Line, net: Path, folder: Path, step: float, steps: int, record_every: float | None = None,

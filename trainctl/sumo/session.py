@@ -11,7 +11,8 @@ import os
 import re
 import sys
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -35,12 +36,23 @@ TOLERANCE_M = 1e-6
 #: Closer than this to the end of its edge a train may be on the next one.
 NEAR_M = 1e-3
 
+#: SUMO's driver decides that often [s]: never, but where it is told to. Every train is commanded in every step, so all it decides
+#: is overruled, and it takes half of SUMO's time. Only its way over the end of an edge has to be planned.
+IDLE_S = 1e6
+
+#: Closer than this to the end of its edge, or beyond, SUMO plans the step.
+PLANNED_M = 1.0
+
+#: What SUMO says about drivers who decide so rarely.
+OF_IDLING = ("Warning: Given action step length", "Warning: Action step length")
+
 OPTIONS = {
     "time-to-teleport": "-1",  # a train held at speed 0 would teleport after 300 s
     "collision.action": "warn",  # the default removes the train; gaps are the monitors' business
     "collision.mingap-factor": "0",  # a gap below minGap is not yet a collision
     "insertion-checks": "none",  # one train per block at insertion, even without signals: the second never appears
     "default.speeddev": "0",
+    "step-method.ballistic": "false",  # said aloud: an action step length would switch it on
     "no-step-log": "true",
     "fcd-output.distance": "true",
     "tripinfo-output.write-unfinished": "true",
@@ -144,6 +156,7 @@ class Sumo:
     """
 
     api: Any = libsumo
+    idle = True  # see IDLE_S
 
     def __init__(self, line: Line, net: Path, folder: Path, step: float, steps: int, record_every: float | None = None) -> None:
         self.line, self.net, self.folder, self.time_step, self.steps = line, net, folder, step, steps
@@ -162,7 +175,9 @@ class Sumo:
         configuration = write_configuration(
             self.folder, self.net.name, "trains.rou.xml", self.time_step, end, self.internal, self.record_every
         )
-        self._lane_position, self._set_speed = _direct(self.api.vehicle.getLanePosition), _direct(self.api.vehicle.setSpeed)
+        vehicle = self.api.vehicle
+        self._lane_position, self._set_speed = _direct(vehicle.getLanePosition), _direct(vehicle.setSpeed)
+        self._plan = _direct(vehicle.setActionStepLength)
         self.ids, self.routes, self.departs_m = list(start.ids), list(start.routes), start.lane_position
         self.ways = lay_out(self.line, start)
         self.way_end = self._way_end()
@@ -176,6 +191,10 @@ class Sumo:
         row = self.ways.first[:-1].copy()
         self.seen = Seen(self.ways.begin[row] + start.lane_position, self.ways.edge[row], row, start.present.copy())
         self.seen.position[everyone] = self.ways.begin[row[everyone]] + self._lane_positions(everyone)
+        if self.idle:
+            with silent():
+                for kind in sorted(set(self.kinds)):
+                    self._call(self.api.vehicletype.setActionStepLength, kind, IDLE_S)
 
     def _ready(self) -> None:
         """Whether SUMO can be started at all."""
@@ -229,8 +248,8 @@ class Sumo:
                 raise CouplingError(f"train {self.ids[i]} is not on the line at {self._time():.3f} s: {why}") from None
         return found
 
-    def _read(self, wanted: Floats, present: Bools) -> Seen:
-        """Where the trains are that should be at ``wanted`` (n,), with one call per train.
+    def _read(self, wanted: Floats, left: Floats, present: Bools) -> Seen:
+        """Where the trains are that should be at ``wanted`` (n,), ``left`` (n,) before the end of their edge, with one call each.
 
         A train that is where it should be, and not near the end of its edge, is on the edge it was on.
         """
@@ -244,8 +263,7 @@ class Sumo:
             raise
         position = wanted.copy()
         position[there] = begin[there] + lane_position
-        at_the_end = wanted > begin + self.line.length_m[ways.edge[row]] - NEAR_M
-        ask = np.flatnonzero((at_the_end | ~(np.abs(position - wanted) <= TOLERANCE_M)) & present)
+        ask = np.flatnonzero(((left < NEAR_M) | ~(np.abs(position - wanted) <= TOLERANCE_M)) & present)
         if len(ask):
             row = row.copy()
             row[ask] = self._rows(ask)
@@ -275,12 +293,16 @@ class Sumo:
 
     def move(self, displacement: Floats, step: float) -> None:
         """Command the mean speed of the step, displacement / T: SUMO's Euler update then moves the train by just that."""
-        before, present = self.seen.position, self.seen.present
-        self._call(self._command, np.flatnonzero(present), displacement / step)
-        self._call(self.api.simulationStep)
+        before, row, present = self.seen.position, self.seen.row, self.seen.present
         wanted = np.where(present, before + displacement, before)
+        left = self.ways.begin[row] + self.line.length_m[self.ways.edge[row]] - wanted
+        self._call(self._command, np.flatnonzero(present), displacement / step)
+        if self.idle:
+            for i in np.flatnonzero(present & (left < PLANNED_M)).tolist():
+                self._call(self._plan, self.ids[i], 0.0)
+        self._call(self.api.simulationStep)
         present = present & ~self._left(wanted, present)
-        now = self._read(wanted, present)
+        now = self._read(wanted, left, present)
         wrong = np.flatnonzero(np.abs(now.position - wanted) > TOLERANCE_M)
         if len(wrong):
             raise CouplingError("; ".join(self._explain(int(i), now, before, displacement) for i in wrong[:5]))
@@ -336,7 +358,8 @@ class Sumo:
 
     def messages(self) -> list[tuple[float | None, str]]:
         """Warnings and errors SUMO wrote, with the time it named, if any."""
-        return messages(self.folder / LOGS["log"])
+        found = messages(self.folder / LOGS["log"])
+        return [(at, text) for at, text in found if not text.startswith(OF_IDLING)]
 
     def _time(self) -> float:
         return float(self.api.simulation.getTime()) - self.time_step
@@ -354,6 +377,19 @@ def _direct(function: Any) -> Any:
     """Find the compiled function that a function of libsumo hands its arguments on to: handing on takes a third of a call."""
     compiled = getattr(sys.modules.get(function.__module__), "_libsumo", None)
     return getattr(compiled, f"vehicle_{function.__name__}", function)
+
+
+@contextmanager
+def silent() -> Iterator[None]:
+    """What libsumo prints on stderr meanwhile goes nowhere; it stands in SUMO's message log, too."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def _ended(path: Path) -> bool:
