@@ -29,8 +29,8 @@ class View(NamedTuple):
 
 
 def look(
-    ways: Ways, net: along.Net, limit: Floats, row: Ints, s: Floats, speed: Floats, length: Floats, present: Bools, horizon: float,
-    held: Floats, order: along.Order | None,
+    ways: Ways, net: along.Net, limit: Floats, factor: Floats, row: Ints, s: Floats, speed: Floats, length: Floats, present: Bools,
+    horizon: float, held: Floats, order: along.Order | None,
 ) -> View:  # fmt: skip
     """Look ahead along the ways of all trains.
 
@@ -42,6 +42,8 @@ def look(
         Of the railway, see ``along.net``.
     limit : ndarray, shape (E,)
         Greatest speed on every edge [m/s].
+    factor : ndarray, shape (n,)
+        Share of that which every train keeps to.
     row, s, speed, length, present : ndarray, shape (n,)
         Row in the ways, front [m], speed [m/s], length [m], and whether it is on the net.
     horizon : float
@@ -64,7 +66,8 @@ def look(
     far_first = np.argsort(-bodies.room)
     there = far_first[bodies.sense[far_first] != 0]
     room[bodies.train[there]], body[bodies.train[there]] = bodies.room[there], bodies.other[there]  # the nearest is written last
-    return View(along.ahead(placed), targets, clear, Limits(*_limits(ways, limit, row, s, length, present, horizon)), room, body)
+    limits = Limits(*_limits(ways, limit, factor, row, s, length, present, horizon))
+    return View(along.ahead(placed), targets, clear, limits, room, body)
 
 
 def _targets(body: along.Bodies, held: Floats, speed: Floats, present: Bools) -> Targets:
@@ -87,7 +90,7 @@ def _targets(body: along.Bodies, held: Floats, speed: Floats, present: Bools) ->
 
 @njit(cache=True)
 def _limits(
-    ways: Ways, limit: Floats, row: Ints, s: Floats, length: Floats, present: Bools, horizon: float
+    ways: Ways, limit: Floats, factor: Floats, row: Ints, s: Floats, length: Floats, present: Bools, horizon: float
 ) -> tuple[Ints, Floats, Floats]:
     """Train, distance and speed of the limits under every train and ahead of it within the horizon."""
     count = 0
@@ -103,7 +106,7 @@ def _limits(
                 k -= 1
             last = np.inf
             while k < ways.first[i + 1] and ways.begin[k] - s[i] < horizon:
-                v = limit[ways.edge[k]]
+                v = factor[i] * limit[ways.edge[k]]
                 if ways.begin[k] <= s[i] or v < last:  # one that is no lower than the one before tells nothing new
                     if again:
                         train[count], distance[count], speed[count] = i, ways.begin[k] - s[i], v

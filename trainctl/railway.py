@@ -38,6 +38,7 @@ class Lookout:
         self.p = p
         self.rails, self.net = p.rails, along.net(p.rails)
         self.length = p.consists.train_length()
+        self.factor = np.ones(len(self.length)) if p.roster is None else p.roster.speed_factor
         self.claims = claims.none()
         self.waits_for: Ints = np.full(len(self.length), -1)
         self.theta = p.step_theta
@@ -69,8 +70,8 @@ class Lookout:
         if self.p.roster is not None:
             horizon = max(horizon, self.p.driving.join_range_m)
         return lookout.look(
-            ways, self.net, self.rails.speed_mps, seen.row, seen.position, speed, self.length, seen.present, horizon, held.room,
-            claims.order(self.claims),
+            ways, self.net, self.rails.speed_mps, self.factor, seen.row, seen.position, speed, self.length, seen.present, horizon,
+            held.room, claims.order(self.claims),
         )  # fmt: skip
 
     def _tell(self, journal: Journal, t: float, said: list[claims.Decision], held: claims.Held) -> None:

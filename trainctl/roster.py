@@ -17,7 +17,7 @@ from trainctl.scenario import Scenario, Train, TrainType
 from trainctl.scenario import Traffic as Driving
 from trainctl.signals import Bools, Floats, Ints
 from trainctl.traffic import Departure, Traffic, read_traffic
-from trainctl.traffic_kinds import Kind, train_type
+from trainctl.traffic_kinds import train_type
 
 
 class Stop(NamedTuple):
@@ -37,6 +37,7 @@ class Roster(NamedTuple):
     lane_position: Floats  # (n,) m, front, at departure
     speed: Floats  # (n,) m/s at departure, NaN: as fast as is safe
     top_speed: Floats  # (n,) m/s
+    speed_factor: Floats  # (n,) share of a speed limit that a train keeps to, at most 1: nobody is driven above a limit
     routes: tuple[tuple[str, ...], ...]  # edge ids, internal ones included
     stops: tuple[tuple[Stop, ...], ...]
     cooperates: Bools  # (n,)
@@ -91,8 +92,9 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         if not any(fnmatch.fnmatchcase(i, p) for i in ids)
     ]
     found += _events(scenario, ids, rails)
-    trains, routes, stops, top_speed = [], [], [], []
-    for d in traffic.departures:
+    trains, routes, stops = [], [], []
+    factor = np.array([min(traffic.kinds[d.kind].speed_factor, 1.0) for d in traffic.departures])
+    for d, share in zip(traffic.departures, factor.tolist(), strict=True):
         try:
             way = rails.way(d.edges)
             begin = rails.start_m[way[0]] + np.concatenate([[0.0], np.cumsum(rails.length_m[way[:-1]])])
@@ -101,12 +103,11 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
             found.append(f"network.sumocfg: train {d.id}: {error}")
             continue
         routes.append(tuple(rails.edges[e] for e in way.tolist()))
-        top_speed.append(_top_speed(traffic.kinds[d.kind], rails.speed_mps[way]))
         trains.append(
             Train(
                 id=d.id, type=d.kind, track=d.edges[0], position_m=float(begin[0] + d.position_m),
                 speed_mps=min(float(d.speed_mps if d.speed_mps is not None else scenario.reference.speed_mps or 0.0),
-                              traffic.kinds[d.kind].max_speed_mps, float(rails.speed_mps[way[0]])),
+                              traffic.kinds[d.kind].max_speed_mps, share * float(rails.speed_mps[way[0]])),
             )
         )  # fmt: skip
     if found:
@@ -117,7 +118,8 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         edge=np.array([rails.index[d.edges[0]] for d in departures], np.int64),
         lane_position=np.array([d.position_m for d in departures]),
         speed=np.array([math.nan if d.speed_mps is None else d.speed_mps for d in departures]),
-        top_speed=np.array(top_speed),
+        top_speed=np.array([traffic.kinds[d.kind].max_speed_mps for d in departures]),
+        speed_factor=factor,
         routes=tuple(routes),
         stops=tuple(stops),
         cooperates=together,
@@ -168,8 +170,3 @@ def _stops(departure: Departure, rails: Rails, way: Ints, begin: Floats, begin_s
         until = -math.inf if stop.until_s is None else stop.until_s - begin_s
         found.append(Stop(float(begin[row] + stop.position_m), stop.duration_s, until, stop.name or stop.edge))
     return tuple(found)
-
-
-def _top_speed(kind: Kind, limits: Floats) -> float:
-    """Greatest speed of a train on a way of these limits. A speed factor above 1 has no effect: nobody is driven above a limit."""
-    return kind.max_speed_mps if kind.speed_factor >= 1.0 else min(kind.max_speed_mps, kind.speed_factor * float(limits.max()))

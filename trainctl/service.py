@@ -131,7 +131,8 @@ class Service:
     def entering_speed(self, i: int, speed: Floats, view: View) -> float | None:
         """Speed with which a train can enter safely; None if it has to wait. ``view`` is that with the train at its place."""
         rules, v = self.rules, self.roster.speed[i]
-        on_edge = float(self.p.rails.speed_mps[self.roster.edge[i]]) - self.driving.below_limit_mps
+        limit = float(self.roster.speed_factor[i] * self.p.rails.speed_mps[self.roster.edge[i]])
+        on_edge = limit - self.driving.below_limit_mps
         wanted = float(min(self.cruise[i], max(on_edge, 0.0)) if np.isnan(v) else v)
         if (stop := self.stop_of(i)) is not None:  # it must be able to stop there
             ahead = stop.place - float(self.p.rails.start_m[self.roster.edge[i]]) - float(self.roster.lane_position[i])

@@ -159,11 +159,13 @@ def test_a_train_starts_no_faster_than(enrolled: Read, said: Any, top: float, sp
     assert enrolled(nets.train("a", WAY, 0, departSpeed=said), types=types)[0].train[0].speed_mps == speed
 
 
-@pytest.mark.parametrize(("top", "factor", "speed"), [(30, 0.8, 30.0), (30, 1.2, 30.0), (45, 0.8, 32.0), (45, 1.2, 45.0)])
+@pytest.mark.parametrize(("top", "factor", "speed"), [(30, 0.8, 30.0), (30, 1.2, 30.0), (45, 0.8, 32.0), (45, 1.2, 35.0)])
 def test_a_speed_factor_is_of_the_limits_not_of_the_train(enrolled: Read, top: float, factor: float, speed: float) -> None:
-    """As fast as SUMO drives such a train where 40 m/s are allowed, measured."""
+    """As fast as SUMO drives such a train where 40 m/s are allowed, measured; but nobody is driven above the reference, or a limit."""
     types = f'<vType id="emu" vClass="rail" length="100" maxSpeed="{top}" speedFactor="{factor}"/>'
-    assert enrolled(nets.train("a", WAY, 0), types=types)[1].top_speed.tolist() == [speed]
+    scenario, roster, _ = enrolled(nets.train("a", WAY, 0), types=types)
+    assert (roster.top_speed.tolist(), roster.speed_factor.tolist()) == ([float(top)], [min(factor, 1.0)])
+    assert scenario.train[0].speed_mps == speed
 
 
 # Stops

@@ -36,6 +36,7 @@ class Departure(NamedTuple):
     depart: float  # s
     speed: float | None  # m/s; None: as fast as SUMO takes for safe
     top_speed: float  # m/s
+    speed_factor: float  # share of a speed limit that it keeps to
     placed: bool  # whatever SUMO thinks of it
     stops: tuple[Stop, ...]
 
@@ -83,7 +84,7 @@ def departures(p: Prepared) -> list[Departure]:
         found.append(Departure(
             id=t.id, vclass="rail", route=tuple(line.route(t.track, position)), position_m=float(line.locate(t.track, position)[1]),
             depart=k * p.params.entry_every_s, speed=float(t.speed_mps) if entry is None else p.params.entry_speed_mps,
-            top_speed=top, placed=entry is None, stops=(),
+            top_speed=top, speed_factor=1.0, placed=entry is None, stops=(),
         ))  # fmt: skip
     return found
 
@@ -113,8 +114,8 @@ def _coming(p: Prepared) -> list[Departure]:
         found.append(Departure(
             id=name, vclass=roster.vclass[i], route=roster.routes[i], position_m=float(roster.lane_position[i]),
             depart=float(roster.depart[i]), speed=None if np.isnan(speed) else speed,
-            top_speed=float(roster.top_speed[i]) if top is None else min(top, float(roster.top_speed[i])), placed=False,
-            stops=tuple(stops),
+            top_speed=float(roster.top_speed[i]) if top is None else min(top, float(roster.top_speed[i])),
+            speed_factor=float(roster.speed_factor[i]), placed=False, stops=tuple(stops),
         ))  # fmt: skip
     return found
 
@@ -122,13 +123,13 @@ def _coming(p: Prepared) -> list[Departure]:
 def write_routes(p: Prepared, trains: list[Departure], path: Path) -> None:
     """The trains as SUMO vehicles: true lengths, no randomness, driven by the ``Rail`` model."""
     lengths = np.maximum(p.consists.train_length(), 1.0).tolist()  # SUMO has no points
-    keys = [(d.vclass, length, d.top_speed) for d, length in zip(trains, lengths, strict=True)]
+    keys = [(d.vclass, length, d.top_speed, d.speed_factor) for d, length in zip(trains, lengths, strict=True)]
     kinds = {key: f"train{k}" for k, key in enumerate(dict.fromkeys(keys), 1)}
     lines = ["<routes>"]
     lines += [
         f'    <vType id="{kind}" vClass="{vclass}" guiShape="rail" carFollowModel="Rail" trainType="{p.params.train_type}"'
-        f' length="{length!r}" maxSpeed="{top!r}" sigma="0" speedFactor="1" speedDev="0"/>'
-        for (vclass, length, top), kind in kinds.items()
+        f' length="{length!r}" maxSpeed="{top!r}" sigma="0" speedFactor="{factor!r}" speedDev="0"/>'
+        for (vclass, length, top, factor), kind in kinds.items()
     ]
     for d, key in sorted(zip(trains, keys, strict=True), key=lambda pair: pair[0].depart):
         given = {
