@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import zlib
 from pathlib import Path
 from typing import NamedTuple
 from xml.parsers import expat
@@ -35,8 +37,34 @@ class NetFile(NamedTuple):
     junctions: list[NetJunction]
 
 
+def content(path: Path) -> bytes:
+    """What is in a net file, unpacked: SUMO's nets are often gzipped.
+
+    Raises
+    ------
+    LineError
+        If there is no such file, or it cannot be read.
+    """
+    try:
+        packed = path.read_bytes()
+        return gzip.decompress(packed) if packed[:2] == b"\x1f\x8b" else packed
+    except FileNotFoundError:
+        raise LineError([f"{path}: no such net file"]) from None
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise LineError([f"{path}: damaged gzip: {error}"]) from None
+    except OSError as error:
+        raise LineError([f"{path}: cannot be read: {error.strerror}"]) from None
+
+
+def unpack(net: Path, folder: Path) -> Path:
+    """Copy a net into ``folder``, gzipped or not: ``NAME.net.xml`` there."""
+    target = folder / net.name.removesuffix(".gz")
+    target.write_bytes(content(net))
+    return target
+
+
 def read_net(path: Path) -> NetFile:
-    """The net in a file.
+    """The net in a file, gzipped or not.
 
     Raises
     ------
@@ -79,12 +107,7 @@ def read_net(path: Path) -> NetFile:
     parser.StartElementHandler, parser.EndElementHandler = start, end
     parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
     try:
-        with path.open("rb") as file:
-            parser.ParseFile(file)
-    except FileNotFoundError:
-        raise LineError([f"{path}: no such net file"]) from None
-    except OSError as error:
-        raise LineError([f"{path}: cannot be read: {error.strerror}"]) from None
+        parser.Parse(content(path), True)
     except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: an encoding that is none
         raise LineError([f"{path}: not XML: {error}"]) from None
     return net

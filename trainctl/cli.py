@@ -339,12 +339,13 @@ def net_show(
     from sumo_net.shapes import built_here
 
     path = out or Path(f"{Path(name).name.split('.')[0]}.png")
-    if name.endswith(".xml") and not _net(lambda: built_here(Path(name))):
+    net = name.endswith((".xml", ".xml.gz"))
+    if net and not _net(lambda: built_here(Path(name))):
         if from_m is not None or to_m is not None:
             raise InputError(f"--from-m, --to-m: {name} has no kilometrage; only lines built by `trainctl net build` have one")
         print(_net(lambda: show_net(name, path)))
         return
-    line = _net(lambda: sumo_net.Line.read(name) if name.endswith(".xml") else sumo_net.Line.of(_line_spec(name)))
+    line = _net(lambda: sumo_net.Line.read(name) if net else sumo_net.Line.of(_line_spec(name)))
     _net(lambda: show(line, path, from_m=from_m, to_m=to_m))
     print(path)
 

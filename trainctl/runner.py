@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import shutil
 import signal
 import sys
 import threading
@@ -20,6 +19,7 @@ import tomli_w
 
 import sumo_net
 from sumo_net import LineError
+from sumo_net.netfile import unpack
 from trainctl import checkpoint
 from trainctl.errors import InputError, SimulatorError
 from trainctl.loop import Simulation
@@ -315,8 +315,7 @@ def begin(partial: Path, p: Prepared, every_s: float | None) -> None:
     keep_law(p, place)
     start: dict[str, Any] = {"file": p.file, "checkpoint_every_s": every_s}
     if p.net is not None:
-        start["net"] = p.net.name
-        shutil.copyfile(p.net, place / p.net.name)
+        start["net"] = unpack(p.net, place).name
     else:
         start["line"] = p.spec.model_dump(mode="json", by_alias=True, exclude_none=True)
     checkpoint.replace(place / checkpoint.START, json.dumps(start).encode())
@@ -363,11 +362,7 @@ def open_world(p: Prepared, folder: Path, backend: Backend, gui: str | None = No
     run, place = p.scenario.run, folder / "sumo"
     place.mkdir()
     try:
-        if p.net is None:
-            net = sumo_net.build(p.spec, place)
-        else:
-            net = place / p.net.name
-            net.write_bytes(p.net.read_bytes())
+        net = sumo_net.build(p.spec, place) if p.net is None else unpack(p.net, place)
     except LineError as error:
         raise SimulatorError("; ".join(error.mistakes)) from None
     if gui is not None:

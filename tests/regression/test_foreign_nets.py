@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from sumo import SUMO_HOME
 
 from trainctl.errors import InputError
 from trainctl.prepare import open_scenario
+from trainctl.record.diff import EXACT, diff
 from trainctl.record.run import Run
 from trainctl.runner import run
 
@@ -67,6 +69,23 @@ def test_joins_and_branchings_with_and_without_internal_edges(tmp_path, options)
     unharmed(found)
     assert kinds(found)["couple"] >= 3
     assert order_at(found, "main") == ["w.0", "s.0", "w.1", "s.1", "w.2", "s.2"]
+
+
+def test_a_net_may_be_gzipped(tmp_path, typed):
+    """SUMO's often are: everything is as with the same net unpacked, which is what the run folder keeps."""
+    nets.branches(tmp_path, number=1)
+    plain = go(tmp_path, nets.scenario("robust_constrained", 60))
+    (tmp_path / "a.net.xml.gz").write_bytes(gzip.compress((tmp_path / "a.net.xml").read_bytes()))
+    (tmp_path / "a.sumocfg").write_text((tmp_path / "a.sumocfg").read_text().replace("a.net.xml", "a.net.xml.gz"))
+    packed = run(open_scenario(str(tmp_path / "s.toml")), tmp_path / "packed", "sumo")
+    assert diff(plain.folder, packed.folder, EXACT).lines() == []
+    assert (packed.folder / "sumo" / "a.net.xml").read_bytes() == (tmp_path / "a.net.xml").read_bytes()
+    assert typed("net", "show", "a.net.xml.gz", "--out", "a.png") == (0, [])
+    (tmp_path / "a.net.xml.gz").write_bytes((tmp_path / "a.net.xml.gz").read_bytes()[:-100])
+    code, words = typed("net", "show", "a.net.xml.gz", "--out", "b.png")
+    assert code == 2
+    assert len(words) == 1
+    assert "a.net.xml.gz: damaged gzip: " in words[0]
 
 
 def test_backends_agree_where_trains_come_join_and_leave(tmp_path):

@@ -10,6 +10,7 @@ import numpy as np
 
 import sumo_net
 from sumo_net import Line, LineError
+from sumo_net.netfile import content, unpack
 from trainctl.controllers.sumo import SIGNALS_M
 from trainctl.errors import InputError
 from trainctl.prepare import Prepared
@@ -50,13 +51,10 @@ def network(p: Prepared, folder: Path) -> tuple[Line, Path]:
         The signals cannot stand there, or a net that came as a file has none.
     """
     if p.net is not None:
-        net = folder / p.net.name
-        content = p.net.read_bytes()
-        if p.params.block == "fixed" and b'type="rail_signal"' not in content:
+        if p.params.block == "fixed" and b'type="rail_signal"' not in content(p.net):
             rule = 'has no rail signals; give it some, or take block = "moving"'
             raise InputError(f"{p.file}: controller.block = fixed: {p.net.name} {rule}")
-        net.write_bytes(content)
-        return p.line, net
+        return p.line, unpack(p.net, folder)
     spec = p.spec.model_copy(update={"signals_m": p.params.signals_m or p.spec.signals_m or SIGNALS_M})
     try:
         spec = sumo_net.parse_spec(spec.model_dump(mode="json", by_alias=True, exclude_none=True), spec.name)
