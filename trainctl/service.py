@@ -98,6 +98,9 @@ class Service:
         self.ask_at = np.zeros(n)
         self.parted: Ints = np.full(n, -1)  # the train each was coupled to before
         self.refused: Ints = np.full(n, -1)  # the train the law did not let each couple to, as was told
+        self.lag = np.zeros(n)  # s, brakes act that much later
+        if p.scenario.plant.kind == "actuated_units":
+            self.lag = np.maximum.reduceat(1.0 / p.consists.actuator_rate, p.heads)
         self.least, self.greatest = _band(p, self.spacing) if self.roster.cooperates.sum() > 1 else (-np.inf, np.inf)
         # The driver brakes as planned and keeps farther away, so that the supervisor has nothing to do.
         rate = min(self.driving.deceleration_mps2, rules.emergency_mps2)
@@ -206,7 +209,7 @@ class Service:
                 journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=room)
                 continue
             trains.append(i)
-            rooms.append(max(room, 0.0))
+            rooms.append(max(room - self.lag[i] * max(float(speed[i]), 0.0), 0.0))
         found, room_to = np.array(trains, np.int64), np.array(rooms)
         braking = supervisor.stopping_distance(np.maximum(speed[found], 0.0), self.rules.service_mps2, self.step, self.theta)
         near, soon = np.zeros(self.n, bool), np.zeros(self.n, bool)
