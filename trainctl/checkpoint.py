@@ -78,8 +78,9 @@ class Tape:
 
     def __init__(self, world: World, folder: Path, saved: Saved | None = None) -> None:
         self.world, self.path = world, folder / MOVES
-        told: dict[str, Any] = saved.values["tape"] if saved else {"steps": 0, "trains": 0, "crc": 0, "routes": []}
-        self.steps, self.trains, self.crc, self.routes = told["steps"], told["trains"], told["crc"], list(told["routes"])
+        told: dict[str, Any] = saved.values["tape"] if saved else {"steps": 0, "trains": 0, "crc": 0, "routes": [], "entries": []}
+        self.steps, self.trains, self.crc = told["steps"], told["trains"], told["crc"]
+        self.routes, self.entries = list(told["routes"]), list(told["entries"])
         self.buffer = bytearray()
         # unbuffered: what did not fit on the disk must not come back when the file is closed
         self.file = open(self.path, "r+b" if saved else "wb", buffering=0)  # noqa: SIM115  closed by close()
@@ -101,14 +102,16 @@ class Tape:
 
     def replay(self, step: float) -> None:
         """Tell the world, which has just started, everything once more."""
-        routes = {k: [(train, tuple(edges)) for at, train, edges in self.routes if at == k] for k, _, _ in self.routes}
+        routes, entries = _by_step(self.routes), _by_step(self.entries)
         rows = max(1, PIECE // (8 * max(self.trains, 1)))
         with self.path.open("rb") as file:
             for k in range(self.steps):
                 if k % rows == 0:
                     piece = np.frombuffer(file.read(8 * self.trains * min(rows, self.steps - k)), "<f8").reshape(-1, self.trains)
                 for train, edges in routes.get(k, ()):
-                    self.world.route(train, edges)
+                    self.world.route(train, tuple(edges))
+                for train, speed in entries.get(k, ()):
+                    self.world.insert(train, speed)
                 self.world.move(piece[k % rows].copy(), step)
 
     def start(self, start: Start) -> None:
@@ -126,7 +129,8 @@ class Tape:
         self.world.route(train, edges)
 
     def insert(self, train: int, speed: float) -> None:
-        """Put a train on the net: not replayed, so runs in which trains come later have no checkpoints."""
+        """Put a train on the net."""
+        self.entries.append((self.steps, train, speed))
         self.world.insert(train, speed)
 
     @property
@@ -157,7 +161,7 @@ class Tape:
         """Everything told until now, safe on the disk, as a checkpoint names it."""
         self._flush()
         os.fsync(self.file.fileno())
-        return {"steps": self.steps, "trains": self.trains, "crc": self.crc, "routes": self.routes}
+        return {"steps": self.steps, "trains": self.trains, "crc": self.crc, "routes": self.routes, "entries": self.entries}
 
     def close(self) -> None:
         """End the simulation and its logs."""
@@ -167,6 +171,21 @@ class Tape:
     def messages(self) -> list[tuple[float | None, str]]:
         """Warnings the simulator gave."""
         return self.world.messages()
+
+
+def _by_step(told: list[Any]) -> dict[int, list[Any]]:
+    """What was told before each step: (step, train, what) by step."""
+    found: dict[int, list[Any]] = {}
+    for k, train, what in told:
+        found.setdefault(k, []).append((train, what))
+    return found
+
+
+class Unheard:
+    """Where a simulation that starts once more tells what was told before."""
+
+    def event(self, time: float, kind: str, **fields: Any) -> None:
+        """Nobody writes it down."""
 
 
 def write(folder: Path, simulation: Simulation, more: Mapping[str, Any]) -> None:
@@ -288,6 +307,8 @@ def state(simulation: Simulation) -> tuple[dict[str, Any], dict[str, Any]]:
     if s.lookout is not None:
         values |= {"claims": s.lookout.claims}
         arrays |= {"waits_for": s.lookout.waits_for}
+    if s.service is not None:
+        arrays |= {"service": s.service.state()}
     if isinstance(motion, Units):
         values |= {"counted": motion.counted, "sent_at": motion.air.sent_at}
         arrays |= {
@@ -320,6 +341,8 @@ def restore(simulation: Simulation, tape: Tape, saved: Saved) -> None:
     s.outside, s.supervision.acting = arrays["outside"].copy(), arrays["acting"].copy()
     if s.lookout is not None:
         s.lookout.claims, s.lookout.waits_for = values["claims"], arrays["waits_for"].copy()
+    if s.service is not None:
+        refill("service", s.service.state(), arrays)
     s.exchange.heard, s.exchange.ever = arrays["heard"].copy(), arrays["ever"].copy()
     s.exchange.sent.extend(arrays[f"sent.{k}"].copy() for k in range(values["sent"]))
     motion = s.motion

@@ -167,7 +167,9 @@ def open_scenario(name: str, overrides: dict[str, Any] | None = None) -> Prepare
     return prepare(scenario, path.name, path.parent, found)
 
 
-def prepare(scenario: Scenario, file: str, folder: Path, known: Sequence[str] = ()) -> Prepared:
+def prepare(
+    scenario: Scenario, file: str, folder: Path, known: Sequence[str] = (), enrolled: tuple[roster.Roster, Path] | None = None
+) -> Prepared:
     """Everything the loop needs, checked.
 
     Parameters
@@ -180,6 +182,8 @@ def prepare(scenario: Scenario, file: str, folder: Path, known: Sequence[str] = 
         Where relative paths in it start.
     known : sequence of str
         Mistakes found before; what is found here is told together with them.
+    enrolled : tuple of Roster and Path, optional
+        The trains of ``network.sumocfg`` and their net, where the scenario has taken them over already.
 
     Raises
     ------
@@ -206,10 +210,10 @@ def prepare(scenario: Scenario, file: str, folder: Path, known: Sequence[str] = 
     plant_params = attempt(_params, plant.Params, scenario.plant.keys(), "plant")
     network: tuple[Line, Any, Path | None] | None
     if scenario.network.sumocfg is not None:
-        enrolled = attempt(roster.enrol, scenario, folder)
-        if enrolled is None:
+        anew = (scenario, *enrolled) if enrolled is not None else attempt(roster.enrol, scenario, folder)
+        if anew is None:
             raise InputError([f"{file}: {line}" for line in found])
-        scenario, trains, net = enrolled
+        scenario, trains, net = anew
         network = roster.chart(trains.rails), None, net
     else:
         network = attempt(_network, scenario, folder)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import fnmatch
 import math
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -44,6 +45,28 @@ class Roster(NamedTuple):
     vclass: tuple[str, ...]
     notes: tuple[str, ...]  # what of the configuration is not followed
     rails: Rails
+
+
+def tables(roster: Roster) -> dict[str, Any]:
+    """A roster in what JSON knows, but for its net."""
+    found = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in roster._asdict().items()}
+    del found["rails"]
+    return found
+
+
+def from_tables(data: Mapping[str, Any], net: Path) -> Roster:
+    """Read a roster back from its ``tables`` and its net."""
+    numbers = {name: np.array(data[name], float) for name in ("depart", "lane_position", "speed", "top_speed", "speed_factor")}
+    return Roster(
+        **numbers,
+        edge=np.array(data["edge"], np.int64),
+        routes=tuple(tuple(route) for route in data["routes"]),
+        stops=tuple(tuple(Stop(*stop) for stop in stops) for stops in data["stops"]),
+        cooperates=np.array(data["cooperates"], bool),
+        vclass=tuple(data["vclass"]),
+        notes=tuple(data["notes"]),
+        rails=Rails.read(net),
+    )
 
 
 def chart(rails: Rails) -> Line:

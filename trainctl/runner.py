@@ -20,7 +20,7 @@ import tomli_w
 import sumo_net
 from sumo_net import LineError
 from sumo_net.netfile import unpack
-from trainctl import checkpoint
+from trainctl import checkpoint, roster
 from trainctl.errors import InputError, SimulatorError
 from trainctl.loop import Simulation
 from trainctl.prepare import Prepared, prepare
@@ -120,8 +120,6 @@ def opened(
     step = p.scenario.run.step_s
     if every is not None and not (every >= step and abs(every / step - round(every / step)) < 1e-6):
         raise InputError(f"--checkpoint-every {every:g}: must be a multiple of step_s = {step:g}")
-    if every is not None and p.roster is not None:
-        raise InputError("--checkpoint-every: a run with network.sumocfg cannot be resumed yet; leave it out")
     if every is not None and gui is not None:
         raise InputError("--checkpoint-every: a run that is watched cannot be resumed; leave out --gui")
     partial = claim(out, force)
@@ -212,9 +210,13 @@ def _driven(
             world = open_world(p, partial, info["backend"], gui)
             if every_s is not None:
                 world = tape = checkpoint.Tape(world, place, saved)
-            simulation = Simulation(p, world, journal)
             if saved is not None and tape is not None:
+                unheard: Any = checkpoint.Unheard()
+                simulation = Simulation(p, world, unheard)
                 checkpoint.restore(simulation, tape, saved)
+                simulation.journal = journal
+            else:
+                simulation = Simulation(p, world, journal)
             simulation.between = _Between(simulation, journal, tape, place, every_s, stop, elapsed)
             stop.waits = True
             yield simulation
@@ -318,6 +320,8 @@ def begin(partial: Path, p: Prepared, every_s: float | None) -> None:
         start["net"] = unpack(p.net, place).name
     else:
         start["line"] = p.spec.model_dump(mode="json", by_alias=True, exclude_none=True)
+    if p.roster is not None:
+        start["roster"] = roster.tables(p.roster)
     checkpoint.replace(place / checkpoint.START, json.dumps(start).encode())
 
 
@@ -331,17 +335,19 @@ def again(partial: Path) -> tuple[Prepared, float | None]:
     except (OSError, ValueError) as error:
         raise InputError(f"{partial}: it was killed before it began: begin it again with `trainctl run` ({error})") from None
     network, file = data["network"], str(place / "network.toml")
-    if "sumocfg" in network:
-        raise InputError(f"{partial}: a run with network.sumocfg cannot be resumed yet: begin it again with `trainctl run`")
-    if "net" in start:
+    enrolled = None
+    if "roster" in start:
+        net = place / start["net"]
+        enrolled = roster.from_tables(start["roster"], net), net
+    elif "net" in start:
         data["network"] = {"net": str(place / start["net"])}
     elif network["line"].endswith(".toml"):
         Path(file).write_text(tomli_w.dumps(start["line"]), encoding="utf-8")
         data["network"] = {"line": file}
-    scenario, found = examine(data)
+    scenario, found = examine(data, resolved=True)
     if scenario is None:
         raise InputError([f"{partial / 'scenario.toml'}: {line}" for line in found])
-    p = prepare(scenario, start["file"], place, found)
+    p = prepare(scenario, start["file"], place, found, enrolled)
     original = p.scenario.model_copy(update={"network": type(p.scenario.network)(**network)})
     p = dataclasses.replace(p, scenario=original)
     if p.scenario.toml() != text:

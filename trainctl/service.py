@@ -5,7 +5,7 @@ Only runs with ``network.sumocfg`` have this part of the loop; what is ahead of 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -108,6 +108,13 @@ class Service:
             "mode": "on", "emergency_mps2": rate, "service_mps2": rate, "greatest_mps2": self.driving.acceleration_mps2,
             "margin_m": rules.margin_m + DRIVER_MARGIN_M, "emergency_distance_m": 0.0,
         })  # fmt: skip
+
+    def state(self) -> tuple[Any, ...]:
+        """What changes from step to step."""
+        return (
+            self.ahead, self.slot, self.offset, self.pace, self.came, self.left, self.next_stop, self.stands_until, self.stopping,
+            self.stops_soon, self.halted, self.ask_at, self.parted, self.refused,
+        )  # fmt: skip
 
     @property
     def standing(self) -> Bools:

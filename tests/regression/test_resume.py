@@ -12,12 +12,17 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import nets
 import pandas as pd
 import pytest
+import tomli_w
 
 from trainctl.errors import InputError
+from trainctl.loop import Simulation
+from trainctl.prepare import Prepared, open_scenario
+from trainctl.record.folder import remove
 from trainctl.record.run import Run
-from trainctl.runner import resume
+from trainctl.runner import Backend, opened, resume, run
 
 BIN = Path(sys.executable).parent / "trainctl"
 TABLES = ("trains.parquet", "units.parquet", "links.parquet")
@@ -126,29 +131,66 @@ def test_a_killed_run_of_units_ends_as_if_it_had_not_been(share, reference, tmp_
 )
 def test_every_law_resumes_from_any_step(name, settings, tmp_path):
     """In process, stopped by an error at a step between two checkpoints: queues, noise, estimates, disturbances."""
-    from trainctl.prepare import open_scenario
-    from trainctl.runner import opened, run
+    whole = assert_resumed(open_scenario(name, settings), tmp_path, "numeric", (0.5,))
+    assert whole.info["status"] == "complete"
 
-    prepared = open_scenario(name, settings)
-    whole = run(prepared, tmp_path / "whole", "numeric", command_line=["x"])
+
+@pytest.mark.parametrize(
+    ("net", "law", "backend", "duration"),
+    [
+        ("branches", "fully_distributed", "sumo", 900),
+        ("branches", "fault_tolerant", "numeric", 300),
+        ("station", "robust_constrained", "sumo", 700),
+        ("single_track", "robust_constrained", "sumo", 1000),
+        pytest.param("branches", "emu_finite_time", "sumo", 900, marks=pytest.mark.campaign),
+        pytest.param("three_joins", "robust_constrained", "numeric", 2800, marks=pytest.mark.campaign),
+    ],
+)
+def test_runs_of_a_configuration_resume_from_any_step(net, law, backend, duration, tmp_path):
+    """Trains that have come, left, stopped, coupled, claimed switches and taken another way; the configuration itself is gone."""
+    place = tmp_path / "configuration"
+    place.mkdir()
+    if net == "single_track":
+        up = nets.flow("up", nets.UP, 3, 240, departSpeed="0")
+        nets.single_track(place, up + nets.flow("down", nets.DOWN, 3, 240, 20, departSpeed="0"))
+    else:
+        getattr(nets, net)(place)
+    (place / "s.toml").write_text(tomli_w.dumps(nets.scenario(law, duration)))
+    whole = assert_resumed(open_scenario(str(place / "s.toml")), tmp_path, backend, (0.3, 0.7))
+    happened = {event["kind"] for event in whole.events}
+    assert {"depart", "topology"} <= happened
+    assert happened & {"couple", "stop_left", "switch_granted"}
+
+
+def assert_resumed(prepared: Prepared, place: Path, backend: Backend, shares: tuple[float, ...]) -> Run:
+    """A run that ends by an error, once or again, leaves what one that does not leaves; that one."""
+    whole = run(prepared, place / "whole", backend, command_line=["x"])
     steps = whole.info["steps"]
     every = prepared.scenario.run.step_s * 3
+    folder = place / "run"
 
     class Stop(Exception):
         pass
 
-    with (
-        pytest.raises(Stop),
-        opened(prepared, tmp_path / "run", "numeric", command_line=["x"], checkpoint_every_s=every) as simulation,
-    ):
-        while simulation.k < steps // 2:
+    def stopped(simulation: Simulation, share: float) -> None:
+        while simulation.k < round(share * steps):
             simulation.step()
         raise Stop
-    failed = Run(tmp_path / "run.partial").info
-    assert (failed["status"], failed["steps"], failed["failure"]["reason"]) == ("failed", steps // 2, "Stop")
-    done, since = resume(tmp_path / "run")
-    assert since == pytest.approx(steps // 2 // 3 * every)
+
+    with pytest.raises(Stop), opened(prepared, folder, backend, command_line=["x"], checkpoint_every_s=every) as simulation:
+        stopped(simulation, shares[0])
+    remove(place / "configuration")
+    for share in shares[1:]:
+        with pytest.MonkeyPatch.context() as patch, pytest.raises(Stop):
+            patch.setattr(Simulation, "run", lambda simulation, _, share=share: stopped(simulation, share))
+            resume(folder)
+    last = round(shares[-1] * steps)
+    failed = Run(place / "run.partial").info
+    assert (failed["status"], failed["steps"], failed["failure"]["reason"]) == ("failed", last, "Stop")
+    done, since = resume(folder)
+    assert since == pytest.approx(last // 3 * every)
     assert_same(done.folder, whole.folder)
+    return whole
 
 
 @pytest.mark.parametrize("moment", ["replace", "rename", "join", "metrics", "info", "remove", "finish", "old"])

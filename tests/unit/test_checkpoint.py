@@ -28,6 +28,9 @@ class Deaf(Numeric):
     def route(self, train, edges):
         self.told.append((train, edges))
 
+    def insert(self, train, speed):
+        self.told.append(("enters", train, speed))
+
     def move(self, displacement, step):
         self.told.append((displacement.tolist(), step))
 
@@ -52,6 +55,7 @@ def test_a_tape_tells_the_same_again_and_drops_what_came_later(line, tmp_path, m
         if k in (0, 7, 12):
             tape.route(k % 2, (f"e{k}", "f"))
             tape.route(0, ("g",))
+            tape.insert(1, 1 / 3 + k)
         tape.move(np.array([0.1 * k, 1 / 3]), 0.5)
         if k == 19:
             saved = json.loads(json.dumps(tape.save()))
@@ -133,6 +137,18 @@ def test_every_array_of_the_loop_is_in_a_checkpoint(tmp_path):
             assert found - known - fixed == set()
         assert {"alarms", "sent", "heard", "ever", "seen"} <= arrays.keys()
         assert json.loads(json.dumps(values)) == values
+
+
+def test_every_array_of_trains_that_come_and_go_is_in_a_checkpoint(tmp_path):
+    """Whoever adds an array to the service has to say whether it changes."""
+    with opened(open_scenario("merging", {"run.duration_s": 3}), tmp_path / "run", "numeric") as simulation:
+        simulation.run()
+        service = simulation.service
+        kept = {id(array) for _, array in leaves("x", checkpoint.state(simulation)[1]["service"])}
+        lost = {name for name, value in vars(service).items() if any(id(array) not in kept for _, array in leaves("x", value))}
+        assert lost == {"roster", "cruise", "lag"}  # as they were read
+        lookout = {name for name, value in vars(simulation.lookout).items() if list(leaves("x", value))}
+        assert lookout == {"net", "length", "factor", "ways", "zones", "waits_for"}
 
 
 @pytest.mark.parametrize("own_line", [False, True])
