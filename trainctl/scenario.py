@@ -39,8 +39,8 @@ class Run(Table):
     control_period_s: Positive | None = Field(
         None, description="Control period T_c of sampled laws [s], a multiple of step_s; default step_s."
     )
-    sub_step_s: Positive = Field(
-        0.01, description="Largest integration step inside a simulator step [s]; not used by the point plant."
+    sub_step_s: float = Field(
+        0.01, ge=1e-6, description="Largest integration step inside a simulator step [s]; not used by the point plant."
     )
     record_every_s: Positive | None = Field(
         None,

@@ -111,10 +111,12 @@ with open(sys.argv[1], "w") as f:
     f.write("</fcd-export>")
 """
 MEASURE = """
-import resource, sys
+import re, sys
+from pathlib import Path
 from trainctl.record.diff import diff
 assert diff(sys.argv[1], sys.argv[2]).same
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+status = Path("/proc/self/status").read_text()  # ru_maxrss is at least that of the process that started this one
+print(int(re.search(r"VmHWM:\\s+(\\d+)", status)[1]) // 1024)
 """
 
 
