@@ -25,6 +25,9 @@ def _name(value: Any) -> Any:
     return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
+#: More are none: beyond, a number of steps is not exact.
+MOST_STEPS = 1e15
+
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Id = Annotated[str, BeforeValidator(_name, json_schema_input_type=int | str)]
@@ -35,7 +38,7 @@ class Run(Table):
     """[run]: time."""
 
     duration_s: Positive = Field(description="Length of the run [s].")
-    step_s: Positive = Field(1.0, description="Step of the simulator T [s].")
+    step_s: float = Field(1.0, ge=0.001, description="Step of the simulator T [s], whole milliseconds.")
     control_period_s: Positive | None = Field(
         None, description="Control period T_c of sampled laws [s], a multiple of step_s; default step_s."
     )
@@ -52,7 +55,8 @@ class Run(Table):
     def _multiples(self) -> Run:
         for key in ("duration_s", "control_period_s", "record_every_s"):
             value = getattr(self, key)
-            if value is not None and abs(value / self.step_s - round(value / self.step_s)) > 1e-6:
+            steps = min(value / self.step_s, MOST_STEPS) if value is not None else 0.0
+            if value is not None and abs(value / self.step_s - round(steps)) > 1e-6:
                 raise ValueError(f"{key} = {value:g}: must be a multiple of step_s = {self.step_s:g}")
         if abs(self.step_s * 1000 - round(self.step_s * 1000)) > 1e-9:
             raise ValueError(f"step_s = {self.step_s:g}: SUMO counts time in whole milliseconds")
