@@ -1,12 +1,14 @@
 """Checkpoints: what a run needs to go on after a kill as if nothing had happened.
 
 SUMO's own saved state is not exact, so it is not used. A checkpoint holds our state; SUMO gets the displacements it was told
-before, from time 0 on, which is exact and takes a fraction of the time of the run. Beside the run, in ``DIR.partial/checkpoint``:
+before, with new routes and trains that came, from time 0 on, which is exact and takes a fraction of the time of the run. Beside the
+run, in ``DIR.partial/checkpoint``:
 
 ==============  ======================================================================================================
-start.json      what was asked for; with the network as it was read, so that a run can begin again from its folder alone
+start.json      what was asked for; with the network, and the trains of a SUMO configuration, as they were read, so that a run
+                can begin again from its folder alone
 moves.bin       every displacement SUMO was told, n float64 per step; what lies beyond the last checkpoint is dropped
-state.npz       the last checkpoint, replaced atomically; written after everything it counts on is closed
+state.npz       the last checkpoint, with routes and entries, replaced atomically; written after everything it counts on is closed
 done.json       all steps are done and closed; only joining, measuring and renaming are left
 reserve         room on the disk for the words that say that the disk is full
 ==============  ======================================================================================================

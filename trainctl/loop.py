@@ -179,7 +179,8 @@ class Simulation:
             held = self.lookout.claim(t, ways, here, speed, self.journal, ~here.present)
             return self.lookout.look(ways, here, speed, held)
         self.service.arrivals(t, here.present, self.journal)
-        self.stops = self.service.stops(t, here, speed, self.journal)
+        overrun = self.motion.overrun(self.own, self.service.rules.service_mps2)
+        self.stops = self.service.stops(t, here, speed, overrun, self.journal)
         present = here.present.copy()
         for i, v in self._entering(t, ways, here):
             self.world.insert(i, v)

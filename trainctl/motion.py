@@ -59,6 +59,10 @@ class Points:
         mean = (moved.own[:, SPEED] - own[:, SPEED]) / self.step
         return moved.own, Motion(moved.displacement, moved.input, mean, moved.limited, moved.clipped, None, {})
 
+    def overrun(self, own: Floats, braking: float) -> Floats:
+        """Nothing acts late here."""
+        return np.zeros(len(own))
+
     def climbs(self, slope: Floats) -> None:
         """Take the slope under every unit (U,), rise / run, for the coming step."""
         self.constants.slope[:] = slope
@@ -191,6 +195,19 @@ class Units:
         """Weight along the track per mass [N/kg], (U,)."""
         force: Floats = point.climbing(own[:, POSITION], self.gradient) + GRAVITY * self.plant.units[:, coupled_units.SLOPE]
         return force
+
+    def overrun(self, own: Floats, braking: float) -> Floats:
+        """How much farther every train comes to a stand than by ``braking`` [m/s2] from now on, as actuators act late [m], (n,).
+
+        Until its brakes act a train gains the speed (a + b) / r on the plan, and loses it only by braking to the end.
+        """
+        if self.p.plant.STATES <= FORCE:
+            return np.zeros(len(self.masses))
+        c, heads = self.p.consists, self.p.heads
+        force = np.add.reduceat(own[:, FORCE], heads) - self.masses * self.believed_resistance(own)
+        acceleration = force / np.add.reduceat(c.mass * c.rotating, heads)
+        lag = np.maximum.reduceat(1.0 / c.actuator_rate, heads)
+        return lag * np.maximum(own[heads, SPEED], 0.0) * np.maximum(acceleration / braking + 1.0, 0.0)
 
     def climbs(self, slope: Floats) -> None:
         """Take the slope under every unit (U,), rise / run, for the coming step."""

@@ -477,7 +477,7 @@ def _messages_fit(p: Prepared) -> list[str]:
 
 
 def _disturbances_fit(p: Prepared) -> list[str]:
-    """Disturbances this law and plant cannot take, and what is wrong in themselves."""
+    """Disturbances this law and plant cannot take, and what is wrong in themselves, or in the plant."""
     scenario = p.scenario
     found = disturbance.violations(scenario.disturbance, scenario.ids, scenario.run.seed, hasattr(p.law, "worst"))
     for k, entry in enumerate(scenario.disturbance, 1):
@@ -485,6 +485,8 @@ def _disturbances_fit(p: Prepared) -> list[str]:
             found.append(f"disturbance[{k}].on = measurement: needs a sampled law; a continuous one has no instants to measure at")
     if scenario.fault and scenario.plant.kind != "actuated_units":
         found.append(f"fault: the plant {scenario.plant.kind} has no actuators that fail; actuated_units has")
+    if scenario.plant.kind == "coupled_units":
+        found += p.plant.violations(p.plant_params, p.first_scene)
     if scenario.plant.kind == "actuated_units":
         found += p.plant.violations(p.plant_params, p.first_scene, scenario.fault)
         if p.plant_params.noise_variance_m2_per_s6 > 0 and scenario.run.seed is None:

@@ -98,9 +98,6 @@ class Service:
         self.ask_at = np.zeros(n)
         self.parted: Ints = np.full(n, -1)  # the train each was coupled to before
         self.refused: Ints = np.full(n, -1)  # the train the law did not let each couple to, as was told
-        self.lag = np.zeros(n)  # s, brakes act that much later
-        if p.scenario.plant.kind == "actuated_units":
-            self.lag = np.maximum.reduceat(1.0 / p.consists.actuator_rate, p.heads)
         self.least, self.greatest = _band(p, self.spacing) if self.roster.cooperates.sum() > 1 else (-np.inf, np.inf)
         # The driver brakes as planned and keeps farther away, so that the supervisor has nothing to do.
         rate = min(self.driving.deceleration_mps2, rules.emergency_mps2)
@@ -143,7 +140,7 @@ class Service:
         rules, v = self.rules, self.roster.speed[i]
         limit = float(self.roster.speed_factor[i] * self.p.rails.speed_mps[self.roster.edge[i]])
         on_edge = limit - self.driving.below_limit_mps
-        wanted = float(min(self.cruise[i], max(on_edge, 0.0)) if np.isnan(v) else v)
+        wanted = float(min(self.cruise[i], max(on_edge, 0.0)) if np.isnan(v) else min(v, limit))
         if (stop := self.stop_of(i)) is not None:  # it must be able to stop there
             ahead = stop.place - float(self.p.rails.start_m[self.roster.edge[i]]) - float(self.roster.lane_position[i])
             room = np.array([ahead - wanted * self.step])
@@ -193,8 +190,11 @@ class Service:
         stops, k = self.roster.stops[i], int(self.next_stop[i])
         return stops[k] if k < len(stops) else None
 
-    def stops(self, t: float, seen: Seen, speed: Floats, journal: Journal) -> tuple[Ints, Floats]:
-        """Arrive at and leave stops; returns the trains that have one ahead and the room to it [m]."""
+    def stops(self, t: float, seen: Seen, speed: Floats, overrun: Floats, journal: Journal) -> tuple[Ints, Floats]:
+        """Arrive at and leave stops; returns the trains that have one ahead and the room to it [m].
+
+        ``overrun`` (n,) is how much farther each train would run than its brakes promise, as they act late [m].
+        """
         trains, rooms = [], []
         for i in np.flatnonzero(seen.present & (self.next_stop < [len(s) for s in self.roster.stops])).tolist():
             stop = self.stop_of(i)
@@ -216,7 +216,7 @@ class Service:
                 journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=room)
                 continue
             trains.append(i)
-            rooms.append(max(room - self.lag[i] * max(float(speed[i]), 0.0), 0.0))
+            rooms.append(max(room - float(overrun[i]), 0.0))
         found, room_to = np.array(trains, np.int64), np.array(rooms)
         braking = supervisor.stopping_distance(np.maximum(speed[found], 0.0), self.rules.service_mps2, self.step, self.theta)
         near, soon = np.zeros(self.n, bool), np.zeros(self.n, bool)

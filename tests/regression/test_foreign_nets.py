@@ -135,13 +135,50 @@ def test_a_train_that_stops_leaves_its_formation_and_another_joins(tmp_path):
     assert kinds(found)["couple"] >= 2
 
 
-@pytest.mark.parametrize(("law", "within_m"), [("fully_distributed", 0.001), ("emu_finite_time", 0.001), ("fault_tolerant", 0.05)])
-def test_trains_stop_where_they_are_to(tmp_path, law, within_m):
-    """Also those of units, whose couplers give, and whose actuators act 20 ms later: 0.7 m at 35 m/s."""
+@pytest.mark.parametrize(
+    ("law", "rate", "within_m"),
+    [
+        ("fully_distributed", 0.0, 0.02),
+        ("emu_finite_time", 0.0, 0.02),
+        ("fault_tolerant", 50.0, 0.05),
+        ("fault_tolerant", 3.0, 0.6),
+    ],
+)
+def test_trains_stop_where_they_are_to(tmp_path, law, rate, within_m):
+    """Also those of units, whose couplers give, and whose brakes act late, out of a cruise and while they still accelerate."""
     nets.station(tmp_path)
-    found = go(tmp_path, nets.scenario(law, 340), "numeric")
-    [stop] = [e for e in found.events if e["kind"] == "stop_reached"]
-    assert abs(stop["short_m"]) < within_m
+    stops = "".join(f'<stop lane="ab_0" endPos="{place}" duration="10"/>' for place in (250, 400, 1300, 6000))
+    nets.traffic(tmp_path, nets.train("a", "ab bc", 0, stops))
+    tables = nets.scenario(law, 520)
+    tables["train_type"]["emu"] |= {"actuator_rate_per_s": rate} if rate else {}
+    found = go(tmp_path, tables, "numeric")
+    short = [e["short_m"] for e in found.events if e["kind"] == "stop_reached"]
+    assert len(short) == 4
+    assert np.abs(short).max() < within_m
+
+
+def test_couplers_of_trains_that_are_driven_rest_however_late_the_actuators_are(tmp_path):
+    """An active stiffness would swing them up: forces come a second late."""
+    nets.station(tmp_path)
+    tables = nets.scenario("fault_tolerant", 330)
+    tables["train_type"]["emu"] |= {"actuator_rate_per_s": 1.0}
+    units = go(tmp_path, tables, "numeric").units
+    assert max(-units.coupler_min_m.min(), units.coupler_max_m.max()) < 1e-6
+
+
+def test_nobody_enters_faster_than_it_may(tmp_path):
+    """A departure speed is given for the limit, of which the train keeps to a share."""
+    nets.limits(tmp_path)
+    slow = nets.EMU.replace("/>", ' speedFactor="0.8"/>')
+    nets.traffic(tmp_path, nets.train("a", "de ef", 0, departSpeed=19), slow)
+    found = go(tmp_path, nets.scenario("robust_constrained", 20))
+    unharmed(found, arrive=False)
+    assert [e["speed_mps"] for e in found.events if e["kind"] == "depart"] == [16.0]
+    native = nets.scenario("robust_constrained", 20) | {"controller": {"law": "sumo", "block": "moving"}}
+    (tmp_path / "native.toml").write_text(tomli_w.dumps(native))
+    driven = run(open_scenario(str(tmp_path / "native.toml")), tmp_path / "native", "sumo")
+    assert driven.info["status"] == "complete"
+    assert driven.trains.speed_mps.iloc[0] == 16.0
 
 
 def test_trains_run_round_a_ring_twice(tmp_path):

@@ -66,7 +66,9 @@ def test_drivers_of_sumo_who_decide_nothing_change_no_log(finished, monkeypatch,
     """All they would decide is overruled: what SUMO writes is the same to the last bit, on lines and where trains come and go."""
     nets.three_joins(tmp_path)
     (tmp_path / "joins.toml").write_text(tomli_w.dumps(nets.scenario("robust_constrained", 1200)))
-    for name, duration in (("three_tracks", 1100), (str(tmp_path / "joins.toml"), 1200)):
+    odd = nets.scenario("robust_constrained", 300, run={"step_s": 0.3})  # a million seconds are no whole number of steps
+    (tmp_path / "odd.toml").write_text(tomli_w.dumps(odd))
+    for name, duration in (("three_tracks", 1100), (str(tmp_path / "joins.toml"), 1200), (str(tmp_path / "odd.toml"), 300)):
         idle = finished(name, **{"run.duration_s": duration})
         with monkeypatch.context() as patch:
             patch.setattr(Sumo, "idle", False)

@@ -109,6 +109,14 @@ CASES |= {
     ),
     "p1 below k/m": (EMU + "[controller]\np_1 = 2.0\n", ["controller.p_1 = 2: must exceed coupler stiffness over mass, 2 1/s2"]),
     "step too large for the law": (EMU + "[run]\nsub_step_s = 0.05\n", ["run.sub_step_s = 0.05: at most 0.0101 s"]),
+    "couplers damped too hard": (
+        EMU + "[plant]\nin_train_damping_per_s = 100.0\n",
+        ["plant.in_train_damping_per_s = 100: at most 62.5 with integration steps of 0.01 s"],
+    ),
+    "stiff couplers through slow actuators": (
+        FAULTY + "[plant]\nin_train_stiffness_per_s2 = 400.0\n",
+        ["plant.in_train_stiffness_per_s2 = 400: at most 100, half of in_train_damping_per_s times the slowest actuator rate"],
+    ),
     "step that never ends": (EMU + "[run]\nsub_step_s = 5e-324\n", ["run.sub_step_s = 5e-324: "]),
     "interval too short": (
         EMU + "[[train]]\nid = 2\nposition_m = 107500.0\n", ["trains 1 and 2: interval = 980.0 m: must start above emergency_distance_m"],

@@ -65,6 +65,9 @@ RATE, NOISE = SLOPE + 1, SLOPE + 2
 class Params(coupled_units.Params):
     """Keys of ``[plant]`` with ``kind = "actuated_units"``, beside those of ``coupled_units``."""
 
+    in_train_stiffness_per_s2: float = Field(
+        0.0, ge=0.0, description="As in coupled_units; at most half the damping times the slowest actuator rate [1/s2]"
+    )
     noise_variance_m2_per_s6: float = Field(
         0.0, ge=0, description="Variance of Gaussian noise in the jerk of every unit [m2/s6]; 0.5 in the paper, needs [run] seed."
     )
@@ -82,12 +85,19 @@ class Constants(NamedTuple):
 
 def violations(params: Params, scene: Scene, faults: Sequence[Fault] = ()) -> list[str]:
     """Every rule about this plant that fails."""
-    found = fault_violations(faults, scene.trains, scene.consists)
+    found = [*coupled_units.violations(params, scene), *fault_violations(faults, scene.trains, scene.consists)]
     first, rate = scene.consists.first, scene.consists.actuator_rate
     for i, train in enumerate(scene.trains):
         least = rate[first[i] : first[i + 1]].min()
         if least <= 0.0:
             found.append(f"actuator_rate_per_s = {least:g}: must be above 0 for train {train} in actuated_units")
+    # Stiffness through a first-order lag swings up: s**3 + r s**2 + a r (d s + k) = 0 is stable for k < r d, whatever a > 0.
+    most = 0.5 * params.in_train_damping_per_s * float(rate.min())
+    if params.in_train_stiffness_per_s2 > most:
+        found.append(
+            f"plant.in_train_stiffness_per_s2 = {params.in_train_stiffness_per_s2:g}: at most {most:.6g}, half of"
+            " in_train_damping_per_s times the slowest actuator rate: forces that come late make couplers swing"
+        )
     samples = params.noise_hold_s / scene.sub_step
     if params.noise_variance_m2_per_s6 > 0.0 and abs(samples - round(samples)) > 1e-6:
         found.append(

@@ -24,7 +24,7 @@ import numpy as np
 from pydantic import Field
 
 from trainctl.kernels import inlined
-from trainctl.signals import GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Table
+from trainctl.signals import GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Scene, Table
 
 STATES = 2
 
@@ -45,6 +45,19 @@ class Params(Table):
     in_train_damping_per_s: float = Field(
         4.0, ge=0.0, description="Active part of the coupler damping where a train is told an acceleration, per unit mass [1/s]"
     )
+
+
+def violations(params: Params, scene: Scene) -> list[str]:
+    """Every rule about this plant that fails: what the active part of couplers asks of the integrator.
+
+    The relative motion of the units of a train of equal ones has modes ``s**2 + a (d s + k) = 0`` with ``0 < a < 4``; classic
+    Runge-Kutta steps of ``h`` keep ``4 d h`` and ``2 sqrt(k) h`` below 2.78, here 2.5.
+    """
+    h, found = scene.sub_step, []
+    for key, most in (("in_train_damping_per_s", 0.625 / h), ("in_train_stiffness_per_s2", (1.25 / h) ** 2)):
+        if getattr(params, key) > most * (1.0 + 1e-9):
+            found.append(f"plant.{key} = {getattr(params, key):g}: at most {most:.6g} with integration steps of {h:g} s")
+    return found
 
 
 class Constants(NamedTuple):

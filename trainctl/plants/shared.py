@@ -6,7 +6,7 @@ law, to be integrated with ``plants.coupled_units``; they also serve trains that
 
 Symbols
 -------
-a_i         acceleration train i holds [m/s2]
+a_i         acceleration train i holds [m/s2]; where orders replace a law, NaN leaves the train to the law
 mu, Mu      lower and upper bound of the input, force per mass [m/s2]
 f, F        least and largest running resistance over the speed band [m/s2]
 rho, Rho    lower and upper speed bound [m/s]
@@ -52,7 +52,7 @@ class Constants(NamedTuple):
     first: Ints  # (n + 1,)
     units: Floats  # (U, 15) as in coupled_units
     gradient: Floats  # (G, 2)
-    acceleration: Floats  # (n,) m/s2, overwritten once per control period
+    acceleration: Floats  # (n,) m/s2, overwritten once per control period, or for orders per step of the simulator
     stiffness: float  # 1/s2
     damping: float  # 1/s
 

@@ -108,7 +108,9 @@ def _coming(p: Prepared) -> list[Departure]:
         for stop in roster.stops[i]:
             row = int(np.searchsorted(begin, stop.place, side="left")) - 1
             stops.append(Stop(rails.edges[way[row]], float(stop.place - begin[row]), stop.duration, stop.until))
-        speed, top = float(roster.speed[i]), p.params.top_speed_mps
+        # Whoever would start faster than it may is refused by SUMO, in the middle of the run.
+        speed = min(float(roster.speed[i]), float(roster.speed_factor[i] * rails.speed_mps[way[0]]))
+        top = p.params.top_speed_mps
         found.append(Departure(
             id=name, vclass=roster.vclass[i], route=roster.routes[i], position_m=float(roster.lane_position[i]),
             depart=float(roster.depart[i]), speed=None if np.isnan(speed) else speed,

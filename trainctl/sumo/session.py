@@ -194,7 +194,7 @@ class Sumo:
         if self.idle:
             with silent():
                 for kind in sorted(set(self.kinds)):
-                    self._call(self.api.vehicletype.setActionStepLength, kind, IDLE_S)
+                    self._call(self.api.vehicletype.setActionStepLength, kind, idle_s(self.time_step))
 
     def _ready(self) -> None:
         """Whether SUMO can be started at all."""
@@ -377,6 +377,11 @@ def _direct(function: Any) -> Any:
     """Find the compiled function that a function of libsumo hands its arguments on to: handing on takes a third of a call."""
     compiled = getattr(sys.modules.get(function.__module__), "_libsumo", None)
     return getattr(compiled, f"vehicle_{function.__name__}", function)
+
+
+def idle_s(step: float) -> float:
+    """``IDLE_S`` in whole steps of the simulator: SUMO rounds anything else, and says so."""
+    return round(math.ceil(IDLE_S / step) * step, 3)
 
 
 @contextmanager
