@@ -207,7 +207,8 @@ class Units:
         force = np.add.reduceat(own[:, FORCE], heads) - self.masses * self.believed_resistance(own)
         acceleration = force / np.add.reduceat(c.mass * c.rotating, heads)
         lag = np.maximum.reduceat(1.0 / c.actuator_rate, heads)
-        return lag * np.maximum(own[heads, SPEED], 0.0) * np.maximum(acceleration / braking + 1.0, 0.0)
+        found: Floats = lag * np.maximum(own[heads, SPEED], 0.0) * np.maximum(acceleration / braking + 1.0, 0.0)
+        return found
 
     def climbs(self, slope: Floats) -> None:
         """Take the slope under every unit (U,), rise / run, for the coming step."""
