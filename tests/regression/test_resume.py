@@ -138,10 +138,10 @@ def test_every_law_resumes_from_any_step(name, settings, tmp_path):
 @pytest.mark.parametrize(
     ("net", "law", "backend", "duration"),
     [
-        ("branches", "fully_distributed", "sumo", 900),
-        ("branches", "fault_tolerant", "numeric", 300),
-        ("station", "robust_constrained", "sumo", 700),
-        ("single_track", "robust_constrained", "sumo", 1000),
+        ("branches", "fully_distributed", "sumo", 450),
+        ("branches", "fault_tolerant", "numeric", 240),
+        ("station", "robust_constrained", "sumo", 450),
+        ("single_track", "robust_constrained", "sumo", 600),
         pytest.param("branches", "emu_finite_time", "sumo", 900, marks=pytest.mark.campaign),
         pytest.param("three_joins", "robust_constrained", "numeric", 2800, marks=pytest.mark.campaign),
     ],

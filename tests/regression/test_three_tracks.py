@@ -65,14 +65,14 @@ def test_rows_every_ten_seconds_are_those_of_every_step(finished, typed, tmp_pat
 def test_drivers_of_sumo_who_decide_nothing_change_no_log(finished, monkeypatch, tmp_path, capfd):
     """All they would decide is overruled: what SUMO writes is the same to the last bit, on lines and where trains come and go."""
     nets.three_joins(tmp_path)
-    (tmp_path / "joins.toml").write_text(tomli_w.dumps(nets.scenario("robust_constrained", 1200)))
-    odd = nets.scenario("robust_constrained", 300, run={"step_s": 0.3})  # a million seconds are no whole number of steps
+    (tmp_path / "joins.toml").write_text(tomli_w.dumps(nets.scenario("robust_constrained", 800)))
+    odd = nets.scenario("robust_constrained", 90, run={"step_s": 0.3})  # a million seconds are no whole number of steps
     (tmp_path / "odd.toml").write_text(tomli_w.dumps(odd))
-    for name, duration in (("three_tracks", 1100), (str(tmp_path / "joins.toml"), 1200), (str(tmp_path / "odd.toml"), 300)):
-        idle = finished(name, **{"run.duration_s": duration})
+    for k, name in enumerate(("fully_distributed", str(tmp_path / "joins.toml"), str(tmp_path / "odd.toml"))):
+        idle = finished(name)
         with monkeypatch.context() as patch:
             patch.setattr(Sumo, "idle", False)
-            planning = run(open_scenario(name, {"run.duration_s": duration}), tmp_path / f"planning_{duration}", "sumo")
+            planning = run(open_scenario(name), tmp_path / f"planning_{k}", "sumo")
         report = diff(planning.folder, idle.folder, EXACT)
         assert report.lines() == []
         assert {"fcd", "tripinfo", "summary", "statistics", "collisions", "vehroute"} <= {t.table for t in report.tables}

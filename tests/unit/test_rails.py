@@ -570,14 +570,14 @@ def test_the_time_of_reading_grows_with_the_edges_not_with_their_pairs(tmp_path)
 
     def took(net):
         times = []
-        for _ in range(3):
+        for _ in range(2):
             began = time.process_time()
             edges = len(Rails.read(net).edges)
             times.append(time.process_time() - began)
         return edges, min(times)
 
-    for nets in ((line("short", 0.85e6), line("long", 3.4e6)), (grid(8), grid(16))):
+    for nets in ((line("short", 0.85e6), line("long", 3.4e6)), (grid(7), grid(14))):
         (few, less), (many, more) = map(took, nets)
         assert 3.5 < many / few < 5.0
         assert more < 2.5 * many / few * less  # four times the edges; with their pairs it were 16 times the time
-    assert many > 3000
+    assert many > 2500
