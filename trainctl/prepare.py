@@ -226,7 +226,7 @@ def prepare(
     consists = scenario.consists()
     bounds = _bounds(scenario, consists)
     # Trains that come and go are checked as the one formation they could be.
-    placed = scenario if trains is None else _in_formation(scenario, plan)
+    placed = scenario if trains is None else roster.in_formation(scenario, plan.slot)
     own = _initial(placed, consists, getattr(plant, "STATES", 2))
     track = np.unique([t.track for t in placed.train], return_inverse=True)[1].astype(np.int64)
     start = own[0, POSITION] - scenario.topology.first_slot_m
@@ -270,16 +270,6 @@ def prepare(
     # What it came to is logged, so that a run can go on from its log.
     stated = prepared.scenario.model_copy(update={"supervisor": prepared.supervision})
     return replace(prepared, scenario=stated)
-
-
-def _in_formation(scenario: Scenario, plan: graph.Plan) -> Scenario:
-    """All trains on one track, every one at its slot and at the reference's speed."""
-    speed = float(scenario.reference.speed_mps or 0.0)
-    trains = tuple(
-        t.model_copy(update={"track": "", "position_m": float(slot), "speed_mps": speed})
-        for t, slot in zip(scenario.train, plan.slot, strict=True)
-    )
-    return scenario.model_copy(update={"train": trains})
 
 
 def _can_brake(p: Prepared) -> list[str]:

@@ -153,6 +153,16 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
     return scenario.model_copy(update={"train": tuple(trains), "train_type": types}), roster, traffic.net
 
 
+def in_formation(scenario: Scenario, slots: Floats) -> Scenario:
+    """All trains on one track, every one at its slot and at the reference's speed."""
+    speed = float(scenario.reference.speed_mps or 0.0)
+    trains = tuple(
+        t.model_copy(update={"track": "", "position_m": float(slot), "speed_mps": speed})
+        for t, slot in zip(scenario.train, slots, strict=True)
+    )
+    return scenario.model_copy(update={"train": trains})
+
+
 def _events(scenario: Scenario, ids: list[str], rails: Rails) -> list[str]:
     """Orders to trains or edges that are not there."""
     found = []

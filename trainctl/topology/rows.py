@@ -26,23 +26,19 @@ def pieces(ways: Ways, row: Ints, s: Floats, length: Floats, present: Bools) -> 
     train, at : ndarray, shape (P,)
         Train and row of each, by train, from the front back.
     """
+    train, at = np.empty(len(ways.begin), np.int64), np.empty(len(ways.begin), np.int64)  # a row is in one way only
     count = 0
-    for again in range(2):
-        if again:
-            train, at = np.empty(count, np.int64), np.empty(count, np.int64)
-        count = 0
-        for i in range(len(row)):
-            if not present[i]:
-                continue
-            k = row[i]
-            while True:
-                if again:
-                    train[count], at[count] = i, k
-                count += 1
-                if k == ways.first[i] or ways.begin[k] <= s[i] - length[i]:
-                    break
-                k -= 1
-    return train, at
+    for i in range(len(row)):
+        if not present[i]:
+            continue
+        k = row[i]
+        while True:
+            train[count], at[count] = i, k
+            count += 1
+            if k == ways.first[i] or ways.begin[k] <= s[i] - length[i]:
+                break
+            k -= 1
+    return train[:count], at[:count]
 
 
 @njit(cache=True)
@@ -64,19 +60,15 @@ def approaches(ways: Ways, joins: Bools, row: Ints, s: Floats, present: Bools, h
         Train and row of each, by train, nearest first.
     """
     first = np.zeros(len(row) + 1, np.int64)
+    train, at = np.empty(len(ways.begin), np.int64), np.empty(len(ways.begin), np.int64)
     count = 0
-    for again in range(2):
-        if again:
-            train, at = np.empty(count, np.int64), np.empty(count, np.int64)
-        count = 0
-        for i in range(len(row)):
-            if present[i]:
-                for k in range(row[i] + 1, ways.first[i + 1]):
-                    if ways.begin[k] - s[i] > horizon:
-                        break
-                    if joins[ways.edge[k]]:
-                        if again:
-                            train[count], at[count] = i, k
-                        count += 1
-            first[i + 1] = count
-    return first, train, at
+    for i in range(len(row)):
+        if present[i]:
+            for k in range(row[i] + 1, ways.first[i + 1]):
+                if ways.begin[k] - s[i] > horizon:
+                    break
+                if joins[ways.edge[k]]:
+                    train[count], at[count] = i, k
+                    count += 1
+        first[i + 1] = count
+    return first, train[:count], at[:count]
