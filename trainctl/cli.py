@@ -212,9 +212,11 @@ def check(name: ScenarioName = DEFAULT_SCENARIO, settings: Settings = None, as_j
     table = _table(None, "", "")
     table.show_header = False
     for key, value in found.items():
-        if key not in ("warnings", "report", "analysis"):
+        if key not in ("warnings", "report", "analysis", "protection", "promise"):
             table.add_row(key, str(value))
     _print(table)
+    for k, line in enumerate(found.get("promise", ())):
+        print(f"protection: {line}" if not k else f"  - {line}")
     for line in found["report"]:
         print(line)
     for line in found["warnings"]:

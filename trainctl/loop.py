@@ -82,6 +82,8 @@ class Simulation:
         period = top.communication_period_s or run.control_period_s or run.step_s
         self.exchange = Exchange(loss=top.loss, delay=round(top.delay_s / period), radius=top.range_m or np.inf, seed=run.seed or 0)
         self.motion: Points | Units = Points(prepared) if prepared.scenario.plant.kind == "point" else Units(prepared)
+        noisy = isinstance(self.motion, Units) and self.motion.noise_hold is not None
+        self.disturbing = noisy or bool(len(self.signals.whole))
         self.demand = Demand(np.zeros(n), np.zeros(n, bool))
         self.outside = np.full(n, np.nan)
         self.alarms = monitor.Alarms(prepared)
@@ -345,32 +347,37 @@ class Simulation:
         stands = ~raw.present
         ordered = free
         if self.service is not None:
-            ordered = self.service.drive(raw, speed, view, self.stops)
+            ordered = self.service.drive(raw, speed, self.motion.acceleration(own), view, self.stops)
             if self.p.rails.slope.any():
                 places = own[:, POSITION] - np.repeat(self.service.offset, np.diff(self.p.consists.first))
                 self.motion.climbs(under(self.world.ways, self.p.rails.slope, raw.row, self.p.consists.first, places))
             stands = stands | self.service.standing | self.service.halted
         if self.supervision.rules.mode == "off":
             return self._advance(t, own, ordered, disturbed, stands)
-        verdict = self.supervision.verdict(view, speed)
+        verdict = self.supervision.verdict(view, speed, self.motion.acceleration(own), disturbed.measurement)
         trial = self.motion.saved(), self.exchange.copy()
-        moved, motion = self._advance(t, own, ordered, disturbed, stands)
-        within, acts = applied(verdict, motion.acceleration)
+        # It judges the step as it would be without what disturbs it, which nobody knows before.
+        moved, motion = self._advance(t, own, ordered, disturbed.calm(), stands, calm=True)
+        within, acts = applied(verdict, motion.asked)
         acts &= ~stands
-        if self.supervision.rules.mode == "on" and acts.any():
+        acts_on = self.supervision.rules.mode == "on" and acts.any()
+        if acts_on or self.disturbing:
             self.motion.restore(trial[0])
             self.exchange = trial[1]
-            ordered = np.where(acts, within, ordered)
+            ordered = np.where(acts, within, ordered) if acts_on else ordered
             moved, motion = self._advance(t, own, ordered, disturbed, stands)
         self.supervision.tell(self.journal, t, verdict, acts, view, speed)
         return moved, motion
 
     def _advance(
-        self, t: float, own: Floats, ordered: Floats, disturbed: disturbance.Disturbed, stands: Bools | None = None
-    ) -> tuple[Floats, Motion]:
+        self, t: float, own: Floats, ordered: Floats, disturbed: disturbance.Disturbed, stands: Bools | None = None,
+        calm: bool = False,
+    ) -> tuple[Floats, Motion]:  # fmt: skip
         """The plant over one step; trains that stand, or are not there, stay as they are."""
         pace = None if self.service is None else self.service.leader()
-        moved, motion = self.motion.advance(self.k, t, own, self.demand, self.links, self.exchange, disturbed, ordered, pace)
+        moved, motion = self.motion.advance(
+            self.k, t, own, self.demand, self.links, self.exchange, disturbed, ordered, pace, calm
+        )  # fmt: skip
         if stands is None:
             return moved, motion
         moved[np.abs(moved[:, SPEED]) < STANDS, SPEED] = 0.0  # a stand ordered is one, rounding aside
@@ -380,7 +387,7 @@ class Simulation:
         moved[np.repeat(stands & here, np.diff(self.p.consists.first)), SPEED] = 0.0
         return moved, motion._replace(
             displacement=np.where(stands, 0.0, motion.displacement), clipped=motion.clipped & ~stands,
-            acceleration=np.where(stands, 0.0, motion.acceleration),
+            acceleration=np.where(stands, 0.0, motion.acceleration), asked=np.where(stands, 0.0, motion.asked),
         )  # fmt: skip
 
     def _check(self, t: float, motion: Motion) -> None:

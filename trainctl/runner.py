@@ -20,7 +20,7 @@ import tomli_w
 import sumo_net
 from sumo_net import LineError
 from sumo_net.netfile import unpack
-from trainctl import checkpoint, roster
+from trainctl import checkpoint, promise, roster
 from trainctl.errors import InputError, SimulatorError
 from trainctl.loop import Simulation
 from trainctl.prepare import Prepared, prepare
@@ -125,7 +125,8 @@ def opened(
     partial = claim(out, force)
     with held(partial):
         text = p.scenario.toml()
-        info = about_run(text, p.scenario.run.seed or 0, command_line or sys.argv, backend=backend)
+        protection = {"protection": promise.told(p)} if p.supervision.mode != "off" else {}
+        info = about_run(text, p.scenario.run.seed or 0, command_line or sys.argv, backend=backend, **protection)
         write_info(partial, info)
         (partial / "scenario.toml").write_text(text, encoding="utf-8")
         keep_law(p, partial)
