@@ -31,7 +31,7 @@ def row_of(p, t=0.0, watched=0, **changes):
     given = {
         "time": t, "seen": Seen(heads[:, POSITION].copy(), np.zeros(n, np.int64), np.zeros(n, np.int64), np.ones(n, bool)), "track": p.start_track, "own": own,
         "speed": heads[:, SPEED].copy(), "ahead": np.full(n, -1), "links": p.first_links,
-        "motion": Motion(np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n, bool), np.zeros(n, bool), None, {}),
+        "motion": Motion(*np.zeros((4, n)), np.zeros(n, bool), np.zeros(n, bool), None, {}),
         "saturated": np.zeros(n, bool), "extremes": Extremes.fresh(n, len(own), watched), "disturbed": None,
     }  # fmt: skip
     return Row(**{**given, **changes})
