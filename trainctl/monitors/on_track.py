@@ -73,14 +73,15 @@ def overlaps(track: Track, ways: Ways, row: Ints, s: Floats, length: Floats, pre
     row, s, length, present : ndarray, shape (n,)
         Row in the ways, front [m], length [m], and whether the train is on the net.
     moved : ndarray, shape (n,)
-        How far each has moved in the last step [m]; 0 for one that has just come.
+        How far each has moved in the last step [m]; NaN: it has just come.
 
     Returns
     -------
     Overlaps
         Also of trains that passed through one another between two instants.
     """
-    return Overlaps(*_overlaps(track, ways, row, s, length, present, np.maximum(moved, 0.0)))
+    come = np.isnan(moved)
+    return Overlaps(*_overlaps(track, ways, row, s, length, present, np.maximum(np.where(come, 0.0, moved), 0.0), come))
 
 
 def limits(track: Track, ways: Ways, row: Ints, s: Floats, length: Floats, present: Bools) -> tuple[Floats, Ints]:
@@ -105,7 +106,7 @@ class Watch:
 
     def broken(self, ways: Ways, seen: Seen, speed: Floats) -> Iterator[dict[str, Any]]:
         """What is wrong now, as fields of an event; ``seen`` counts as the ways do, ``speed`` (n,) [m/s]."""
-        moved = np.nan_to_num(seen.position - self.last)
+        moved = seen.position - self.last
         self.last = np.where(seen.present, seen.position, np.nan)
         found = overlaps(self.track, ways, seen.row, seen.position, self.length, seen.present, moved)
         for a, b, depth, edge, place in zip(*(part.tolist() for part in found), strict=True):
@@ -202,7 +203,7 @@ def _near(n: int, train: Ints, edge: Ints, low: Floats, high: Floats) -> Ints:
 
 @njit(cache=True)
 def _overlaps(
-    track: Track, ways: Ways, row: Ints, s: Floats, length: Floats, present: Bools, moved: Floats
+    track: Track, ways: Ways, row: Ints, s: Floats, length: Floats, present: Bools, moved: Floats, come: Bools
 ) -> tuple[Ints, Ints, Floats, Ints, Floats]:
     """Rows of ``Overlaps``."""
     n = len(row)
@@ -226,7 +227,7 @@ def _overlaps(
             before, now = -before, -now
         a, b = (j, i) if before > 0.0 else (i, j)
         if shared <= ROUNDING:
-            if not before * now < 0.0:
+            if come[i] or come[j] or not before * now < 0.0:
                 continue
             shared = abs(now) + length[a]
         ahead[count], behind[count], depth[count] = a, b, shared
