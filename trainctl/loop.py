@@ -14,6 +14,7 @@ import numpy as np
 from trainctl.errors import LawError
 from trainctl.lookout import View
 from trainctl.monitors import bounds as monitor
+from trainctl.monitors import waiting
 from trainctl.motion import Motion, Points, Units
 from trainctl.plants import disturbance
 from trainctl.plants.integrate import Extremes
@@ -87,6 +88,8 @@ class Simulation:
         self.demand = Demand(np.zeros(n), np.zeros(n, bool))
         self.outside = np.full(n, np.nan)
         self.alarms = monitor.Alarms(prepared)
+        self.kept_out: dict[int, int] = {}  # trains that cannot enter now: because of whom
+        self.not_entered = 0
         self.relinked: tuple[float, Floats, Links] | None = None
         self.between: Callable[[], Any] | None = None
         self._start()
@@ -111,8 +114,9 @@ class Simulation:
         self._check(t, motion)
         self._record(t, seen, before, motion, past, disturbed)
         if view is not None:
-            for alarm in self.alarms.overlaps(t, np.where(seen.present, view.room, np.inf), view.body):
-                self.journal.event(t, "violation", **alarm)
+            speed = before[self.p.heads, SPEED]
+            for kind, told in self.alarms.waits(t, self.world.measure(), speed, view, self.held, self.service, self.kept_out):
+                self.journal.event(t, kind, **told)
         if self.service is not None:
             self.service.advance()
         self.world.move(motion.displacement, self.p.scenario.run.step_s)
@@ -136,6 +140,10 @@ class Simulation:
         if self.service is None:
             self._topology(self.time, seen, None)
         self._record(self.time, seen, self.own, None, self._past(), None)
+        late = [] if self.service is None else self.service.missing(self.time)
+        self.not_entered = len(late)
+        if late:
+            self.journal.event(self.time, "not_entered", trains=late)
 
     def _start(self) -> None:
         p, line, roster = self.p, self.p.line, self.p.roster
@@ -178,8 +186,8 @@ class Simulation:
             return None
         here, ways = self.world.measure(), self.world.ways
         if self.service is None:
-            held = self.lookout.claim(t, ways, here, speed, self.journal, ~here.present)
-            return self.lookout.look(ways, here, speed, held)
+            self.held = self.lookout.claim(t, ways, here, speed, self.journal, ~here.present)
+            return self.lookout.look(ways, here, speed, self.held)
         self.service.arrivals(t, here.present, self.journal)
         overrun = self.motion.overrun(self.own, self.service.rules.service_mps2)
         self.stops = self.service.stops(t, here, speed, overrun, self.journal)
@@ -196,6 +204,7 @@ class Simulation:
         asking = np.zeros(len(speed), bool)
         asking[due] = True
         self.held = self.lookout.claim(t, ways, here, speed, self.journal, asking)
+        self.kept_out.clear()
         come, present = [], here.present.copy()
         for i in due:
             if self.held.room[i] <= 0.0:
@@ -209,6 +218,8 @@ class Simulation:
                 self.own[self.p.consists.first[i] : self.p.consists.first[i + 1], SPEED] = v
                 speed[i] = v
                 come.append((i, v))
+            else:
+                self.kept_out[i] = waiting.kept_out(view, i)
         return come
 
     def _topology(self, t: float, seen: Seen, view: View | None) -> None:
@@ -420,7 +431,7 @@ class Simulation:
             motion=motion, saturated=self._saturated(motion), extremes=past, disturbed=disturbed,
             led=None if self.service is None else self.service.led,
         )  # fmt: skip
-        for alarm in self.alarms.new(row):
+        for alarm in self.alarms.new(row, self.world.ways, self.world.measure()):
             self.journal.event(t, "violation", **alarm)
         if self._recorded:
             self.journal.write(row)

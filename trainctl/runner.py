@@ -225,7 +225,9 @@ def _driven(
             world.close()
             for at, message in world.messages():
                 journal.event(simulation.time if at is None else at, "sumo_warning", message=message)
-            end = {"steps": simulation.k, "violations": simulation.alarms.total, "first_violation": simulation.alarms.first}
+            for at, alarm in simulation.alarms.counted(simulation.time, world.collisions()):
+                journal.event(at, "violation", **alarm)
+            end = {"steps": simulation.k, **simulation.alarms.outcome(simulation.not_entered)}
             done = {"end": end, "wall_time_s": elapsed(), "recorder": journal.recorder.cut()}
             checkpoint.replace(place / checkpoint.DONE, json.dumps(plain(done)).encode())
             journal.close()

@@ -136,6 +136,11 @@ class Service:
             first.setdefault(int(self.roster.edge[i]), i)
         return sorted(first.values(), key=lambda i: (self.roster.depart[i], i))
 
+    def missing(self, t: float) -> list[str]:
+        """Trains whose time had come by ``t`` [s] and that never entered."""
+        late = np.flatnonzero(~self.came & (self.roster.depart <= t + 1e-9))
+        return [self.p.scenario.ids[i] for i in late.tolist()]
+
     def entering_speed(self, i: int, speed: Floats, view: View) -> float | None:
         """Speed with which a train can enter safely; None if it has to wait. ``view`` is that with the train at its place."""
         rules, v = self.rules, self.roster.speed[i]
