@@ -19,9 +19,9 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
     """Run a scenario once per session: finished("three_tracks", "numeric", **{"run.duration_s": 60}) is its run folder."""
-    from trainctl.prepare import open_scenario
-    from trainctl.record.run import Run
     from trainctl.runner import run
+    from trainctl.runs.run import Run
+    from trainctl.scenario.build import open_scenario
 
     done: dict[Any, Run] = {}
 
@@ -38,7 +38,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
 @pytest.fixture
 def typed(tmp_path, monkeypatch, capsys):
     """Type a command: exit code and the lines on stderr."""
-    from trainctl import cli
+    from trainctl.cli import program as cli
 
     monkeypatch.chdir(tmp_path)
 

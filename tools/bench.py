@@ -234,8 +234,8 @@ def inputs(folder: Path, case: str, trains: int, steps: int) -> None:
     """Write what SUMO alone needs into ``folder``: net, trains and configuration, as a run does."""
     import sumo_net
     from trainctl.loop import Simulation
-    from trainctl.prepare import open_scenario
-    from trainctl.record.journal import Journal
+    from trainctl.scenario.build import open_scenario
+    from trainctl.stages.record import Journal
     from trainctl.sumo.session import LOGS, write_configuration, write_routes
     from trainctl.world import Numeric
 
@@ -330,9 +330,9 @@ def closed(folder: Path, case: str) -> Case:
     if case == "traci":
         sys.modules["libsumo"] = through_traci()
     from trainctl.loop import Simulation
-    from trainctl.prepare import open_scenario
-    from trainctl.record.journal import Journal
     from trainctl.runner import open_world
+    from trainctl.scenario.build import open_scenario
+    from trainctl.stages.record import Journal
 
     if case == "finite_time":
         from trainctl.controllers import emu_finite_time

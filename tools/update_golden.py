@@ -10,11 +10,11 @@ import sys
 import tempfile
 from pathlib import Path
 
-from trainctl.prepare import open_scenario
-from trainctl.reading import shipped
-from trainctl.record.diff import EXACT, diff
+from trainctl.diff.runs import EXACT, diff
 from trainctl.record.folder import remove
 from trainctl.runner import run
+from trainctl.scenario.build import open_scenario
+from trainctl.scenario.reading import shipped
 from trainctl.testing import make_golden
 
 GOLDENS = Path(__file__).resolve().parent.parent / "tests" / "regression" / "goldens"

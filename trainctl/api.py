@@ -25,12 +25,12 @@ from pydantic import ValidationError
 
 from trainctl import runner
 from trainctl.errors import InputError
-from trainctl.prepare import open_scenario
-from trainctl.reading import mistakes
-from trainctl.record import run as recorded
-from trainctl.record.outcome import summary
 from trainctl.runner import Backend
-from trainctl.scenario import Event
+from trainctl.runs import run as recorded
+from trainctl.runs.outcome import summary
+from trainctl.scenario.build import open_scenario
+from trainctl.scenario.reading import mistakes
+from trainctl.scenario.tables import Event
 from trainctl.signals import POSITION, SPEED, Floats
 
 if TYPE_CHECKING:
@@ -131,25 +131,26 @@ class Plots:
         self._run = run
 
     def __dir__(self) -> list[str]:
-        from trainctl.record import figures, figures_trains, style
+        from trainctl.figures import catalogue, style
+        from trainctl.figures import trains as figures_trains
 
         with style.styled():
-            return sorted(figures.applicable(figures_trains.prepare(self._run, "double")))
+            return sorted(catalogue.applicable(figures_trains.prepare(self._run, "double")))
 
     def __getattr__(self, name: str) -> Callable[..., Figure]:
-        from trainctl.record import figures
+        from trainctl.figures import catalogue
 
-        if name not in figures.FIGURES:
-            raise AttributeError(f"no figure {name}; there are: {', '.join(figures.FIGURES)}")
+        if name not in catalogue.FIGURES:
+            raise AttributeError(f"no figure {name}; there are: {', '.join(catalogue.FIGURES)}")
 
         def draw(width: str = "double") -> Figure:
-            figure = figures.figure(self._run, name, width)
+            figure = catalogue.figure(self._run, name, width)
             # A notebook shows what has this; figures made without pyplot have it not.
             figure._repr_png_ = lambda: _png(figure)  # type: ignore[attr-defined]
             return figure
 
         draw.__name__ = name
-        draw.__doc__ = figures.FIGURES[name].__doc__
+        draw.__doc__ = catalogue.FIGURES[name].__doc__
         return draw
 
 

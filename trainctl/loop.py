@@ -12,22 +12,22 @@ from typing import Any
 import numpy as np
 
 from trainctl.errors import LawError
-from trainctl.lookout import View
 from trainctl.monitors import bounds as monitor
 from trainctl.monitors import waiting
-from trainctl.motion import Motion, Points, Units
 from trainctl.plants import disturbance
 from trainctl.plants.integrate import Extremes
-from trainctl.prepare import Prepared
-from trainctl.railway import Lookout, Supervision
-from trainctl.record.journal import Journal, Row
-from trainctl.reroute import Reroutes
-from trainctl.service import Service
+from trainctl.railway.authority import View
+from trainctl.railway.supervisor import applied
+from trainctl.railway.ways import Ways, under
+from trainctl.scenario.build import Prepared
 from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Ints, Links, Trains
-from trainctl.supervisor import applied
+from trainctl.stages.convoys import Service
+from trainctl.stages.orders import Reroutes
+from trainctl.stages.plant import Motion, Points, Units
+from trainctl.stages.protect import Lookout, Supervision
+from trainctl.stages.record import Journal, Row
 from trainctl.topology import convoys, graph
 from trainctl.topology.exchange import Exchange
-from trainctl.topology.ways import Ways, under
 from trainctl.world import Seen, Start, World, lay_out
 
 #: Slower than this is a stand [m/s].

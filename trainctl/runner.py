@@ -20,11 +20,10 @@ import tomli_w
 import sumo_net
 from sumo_net import LineError
 from sumo_net.netfile import unpack
-from trainctl import checkpoint, promise, roster
 from trainctl.errors import InputError, SimulatorError
 from trainctl.loop import Simulation
-from trainctl.prepare import Prepared, prepare
-from trainctl.reading import examine
+from trainctl.metrics.run import metrics
+from trainctl.record import checkpoint
 from trainctl.record.folder import (
     about_run,
     claim,
@@ -37,9 +36,11 @@ from trainctl.record.folder import (
     write_info,
     write_json,
 )  # fmt: skip
-from trainctl.record.journal import Journal
-from trainctl.record.metrics import metrics
-from trainctl.record.run import Run
+from trainctl.runs.run import Run
+from trainctl.scenario import promise, roster
+from trainctl.scenario.build import Prepared, prepare
+from trainctl.scenario.reading import examine
+from trainctl.stages.record import Journal
 from trainctl.world import Numeric, World
 
 Backend = Literal["sumo", "numeric"]

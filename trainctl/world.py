@@ -8,8 +8,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from sumo_net import Line
+from trainctl.railway.ways import Ways, rerouted, ways
 from trainctl.signals import Bools, Floats, Ints, Links
-from trainctl.topology.ways import Ways, rerouted, ways
 
 
 class Start(NamedTuple):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from trainctl.record.report import report
+from trainctl.report.page import report
 
 sys.path.insert(0, str(Path(__file__).parent))
 from driver import Browser
@@ -152,8 +152,8 @@ def test_trains_that_come_and_go_are_drawn_on_their_net(finished, browser):
 
 
 def test_a_page_without_animation_is_alive(browser, tmp_path):
-    from trainctl.prepare import open_scenario
     from trainctl.runner import run
+    from trainctl.scenario.build import open_scenario
 
     done = run(open_scenario("merging", {"run.duration_s": 96}), tmp_path / "r", "numeric")
     browser.open(report(done))

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trainctl.topology import along
-from trainctl.topology.ways import ways as laid
+from trainctl.railway import along
+from trainctl.railway.ways import ways as laid
 
 HORIZONS = (40.0, 150.0, 1000.0)
 

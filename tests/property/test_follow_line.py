@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from trainctl.reference import obeying, table
+from trainctl.scenario.reference import obeying, table
 from trainctl.signals import leader_at
 
 RATES = (0.3, 0.5)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from trainctl import supervisor
-from trainctl.supervisor import TRAIN, Assumed, Limits, Params, Targets
+from trainctl.railway import supervisor
+from trainctl.railway.supervisor import TRAIN, Assumed, Limits, Params, Targets
 
 PAIRS = 400
 RULES = Params(mode="on", emergency_mps2=1.0, service_mps2=0.7, margin_m=20.0)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from trainctl.controllers import robust_constrained as law
 from trainctl.controllers import robust_gain
 from trainctl.plants import disturbance, point
-from trainctl.reference import constant
+from trainctl.scenario.reference import constant
 from trainctl.signals import POSITION, SPEED, Bounds, Consists, Floats, Links, Scene, Trains
 
 V0, T = 80.0, 0.8

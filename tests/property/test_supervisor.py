@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from trainctl import supervisor
-from trainctl.supervisor import END, KINDS, OPPOSING, STOP, SWITCH, TRAIN, Limits, Params, Targets
+from trainctl.railway import supervisor
+from trainctl.railway.supervisor import END, KINDS, OPPOSING, STOP, SWITCH, TRAIN, Limits, Params, Targets
 
 PER_COLUMN = 6
 DRIVERS = ("random", "bang-bang", "full traction", "against the follower", "no numbers")

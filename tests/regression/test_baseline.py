@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 
 from sumo_net.build import netconvert
-from trainctl import capacity, runner
+from trainctl import runner
 from trainctl.errors import InputError, SimulatorError
-from trainctl.prepare import open_scenario
-from trainctl.reading import examine
-from trainctl.record.run import Run
+from trainctl.runs.run import Run
+from trainctl.scenario.build import open_scenario
+from trainctl.scenario.reading import examine
 from trainctl.signals import GRAVITY
+from trainctl.studies import capacity
 from trainctl.sumo.baseline import Session
 
 SECTION = 24000.0
@@ -153,8 +154,8 @@ def test_the_shipped_traffic_runs_under_sumo_and_its_record_is_read(tmp_path: Pa
     assert done.metrics["traffic.collisions"] == 0 and done.metrics["traffic.gap_min_m"] > 0.0
     first = done.trains[done.trains["time_s"] == 0.0].set_index("train")
     assert first["position_m"].to_dict() == pytest.approx({t["id"]: t["position_m"] for t in done.scenario["train"]})
-    from trainctl.record.figures import plot
-    from trainctl.record.report import report
+    from trainctl.figures.catalogue import plot
+    from trainctl.report.page import report
 
     assert report(done, None).stat().st_size > 10_000
     assert len(plot(done, tmp_path / "figures", ("png",), "double")) >= 2
@@ -239,8 +240,8 @@ def test_mistakes_are_one_line(tmp_path: Path, keys: dict[str, Any], line: str) 
 
 
 def test_what_sumo_would_not_feel_is_refused() -> None:
-    from trainctl.prepare import prepare
-    from trainctl.reading import read
+    from trainctl.scenario.build import prepare
+    from trainctl.scenario.reading import read
 
     data, path = read("fault_tolerant")
     data["controller"] = {"law": "sumo"}

@@ -14,11 +14,11 @@ import libsumo
 import numpy as np
 import pytest
 
-from trainctl import cli
+from trainctl.cli import program as cli
 from trainctl.errors import CouplingError, LawError, SimulatorError
-from trainctl.prepare import open_scenario
-from trainctl.record.run import Run
 from trainctl.runner import opened, resume, run
+from trainctl.runs.run import Run
+from trainctl.scenario.build import open_scenario
 
 BIN = Path(sys.executable).parent / "trainctl"
 SCENARIO = ("three_tracks", "-q", "--set", "run.duration_s=600")

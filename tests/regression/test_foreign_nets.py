@@ -13,11 +13,11 @@ import pytest
 import tomli_w
 from sumo import SUMO_HOME
 
+from trainctl.diff.runs import EXACT, diff
 from trainctl.errors import InputError
-from trainctl.prepare import open_scenario
-from trainctl.record.diff import EXACT, diff
-from trainctl.record.run import Run
 from trainctl.runner import run
+from trainctl.runs.run import Run
+from trainctl.scenario.build import open_scenario
 
 
 def go(folder: Path, tables: dict[str, Any], backend: str = "sumo") -> Run:

@@ -9,9 +9,9 @@ import pytest
 
 from sumo_net.importing import Options, convert
 from trainctl.errors import InputError
-from trainctl.prepare import open_scenario
-from trainctl.prepare_line import limits
 from trainctl.runner import run
+from trainctl.scenario.build import open_scenario
+from trainctl.scenario.placing import limits
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 ST_GALLEN_WIL = DATA / "ttobench" / "tracks" / "CH_StGallen_Wil.json"

@@ -19,10 +19,10 @@ import tomli_w
 
 from trainctl.errors import InputError
 from trainctl.loop import Simulation
-from trainctl.prepare import Prepared, open_scenario
 from trainctl.record.folder import remove
-from trainctl.record.run import Run
 from trainctl.runner import Backend, opened, resume, run
+from trainctl.runs.run import Run
+from trainctl.scenario.build import Prepared, open_scenario
 
 BIN = Path(sys.executable).parent / "trainctl"
 TABLES = ("trains.parquet", "units.parquet", "links.parquet")
@@ -196,10 +196,10 @@ def assert_resumed(prepared: Prepared, place: Path, backend: Backend, shares: tu
 @pytest.mark.parametrize("moment", ["replace", "rename", "join", "metrics", "info", "remove", "finish", "old"])
 def test_a_kill_while_the_run_ends_leaves_what_can_be_finished(moment, tmp_path, monkeypatch):
     """The process dies at the worst places of the end: between joining, measuring and renaming."""
-    from trainctl import checkpoint, runner
-    from trainctl.prepare import open_scenario
+    from trainctl import runner
+    from trainctl.record import checkpoint, recorder
     from trainctl.record import folder as place
-    from trainctl.record import recorder
+    from trainctl.scenario.build import open_scenario
 
     prepared = open_scenario("three_tracks", {"run.duration_s": 40})
     whole = runner.run(prepared, tmp_path / "whole", "numeric", command_line=["x"])
@@ -264,8 +264,8 @@ def test_without_checkpoints_it_begins_again_and_says_so(tmp_path):
 
 def stopped(tmp_path: Path) -> Path:
     """A run that waits to be resumed."""
-    from trainctl.prepare import open_scenario
     from trainctl.runner import opened
+    from trainctl.scenario.build import open_scenario
 
     prepared = open_scenario("three_tracks", {"run.duration_s": 40})
     with pytest.raises(ZeroDivisionError), opened(prepared, tmp_path / "run", "numeric", checkpoint_every_s=10) as simulation:
@@ -276,7 +276,7 @@ def stopped(tmp_path: Path) -> Path:
 
 
 def test_other_versions_another_scenario_and_damage_are_refused_in_words(tmp_path, monkeypatch):
-    from trainctl import checkpoint
+    from trainctl.record import checkpoint
 
     partial = stopped(tmp_path)
     with monkeypatch.context() as patch:

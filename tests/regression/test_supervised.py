@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import trainctl
-from trainctl.prepare import open_scenario
 from trainctl.runner import run
+from trainctl.scenario.build import open_scenario
 
 ORDERS = 25
 

@@ -14,8 +14,8 @@ import pandas as pd
 import psutil
 import pytest
 
-from trainctl.sweep import Plan, jobs, ready_made, simulate
-from trainctl.sweep_results import write_results
+from trainctl.studies.results import write_results
+from trainctl.studies.sweep import Plan, jobs, ready_made, simulate
 
 BIN = Path(sys.executable).parent
 SEEDS, DURATION = range(8), 300

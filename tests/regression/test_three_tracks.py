@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 import tomli_w
 
-from trainctl.prepare import open_scenario
-from trainctl.record.diff import EXACT, diff
+from trainctl.diff.runs import EXACT, diff
 from trainctl.runner import run
+from trainctl.scenario.build import open_scenario
 from trainctl.sumo.session import Sumo
 
 FULLY_DISTRIBUTED = [

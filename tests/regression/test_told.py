@@ -10,12 +10,12 @@ import pytest
 import tomli_w
 
 import trainctl
-from trainctl.prepare import open_scenario
-from trainctl.record.run import Run
 from trainctl.runner import opened, resume, run
+from trainctl.runs.run import Run
+from trainctl.scenario.build import open_scenario
+from trainctl.studies.results import write_results
+from trainctl.studies.sweep import Plan, jobs, simulate
 from trainctl.sumo.session import collisions
-from trainctl.sweep import Plan, jobs, simulate
-from trainctl.sweep_results import write_results
 
 #: A law that never does anything.
 IDLE = '''
@@ -83,7 +83,7 @@ def test_a_collision_on_a_line_fails_the_run(backend, tmp_path, typed, capsys):
 
 
 def test_the_summary_tells_it_and_never_that_all_held(tmp_path, typed, monkeypatch, capsys):
-    from trainctl import cli
+    from trainctl.cli import program as cli
 
     path = line(tmp_path / "s", RAMS)
     monkeypatch.chdir(tmp_path)
@@ -128,7 +128,7 @@ def head_on(tmp_path_factory):
 @pytest.mark.parametrize("backend", ["numeric", "sumo"])
 def test_unsupervised_on_a_net(head_on, backend, tmp_path, monkeypatch):
     """The driver is blind, too: only then do they meet."""
-    from trainctl.service import Service
+    from trainctl.stages.convoys import Service
 
     monkeypatch.setattr(Service, "drive", lambda self, seen, speed, view, stops: 0.0 * speed)
     # at their places when their time comes, whoever comes towards them

@@ -11,8 +11,8 @@ import pytest
 
 from sumo_net import Rails
 from sumo_net.build import netconvert
-from trainctl.topology import along
-from trainctl.topology.ways import ways as laid
+from trainctl.railway import along
+from trainctl.railway.ways import ways as laid
 
 #: a and b join, then branch off to l and r; numbered as written.
 A, B, M, L, R = range(5)

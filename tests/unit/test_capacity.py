@@ -12,10 +12,10 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from trainctl import capacity
-from trainctl.capacity import Plan
-from trainctl.cli import app
+from trainctl.cli.program import app
 from trainctl.errors import InputError
+from trainctl.studies import capacity
+from trainctl.studies.capacity import Plan
 
 SMALL = Plan(trains=3, length_m=5000.0)
 

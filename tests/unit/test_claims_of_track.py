@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from trainctl.topology import along, claims
-from trainctl.topology.ways import ways as laid
+from trainctl.railway import along, interlocking
+from trainctl.railway.ways import ways as laid
 
 BRAKING = 0.8  # m/s2
 TOP = 30.0  # m/s
@@ -43,7 +43,7 @@ class Yard:
         self.paths = [[net.number[e] for e in path.split()] for path, _, _, _ in trains]
         self.length = np.array([float(t[3]) for t in trains])
         self.at = [(net.number[e], x) for _, e, x, _ in trains]
-        self.state = claims.none()
+        self.state = interlocking.none()
         self.reach = np.full(len(trains), 100.0)
         self.present = np.ones(len(trains), bool)
 
@@ -51,10 +51,10 @@ class Yard:
         ways = self.net.ways(self.paths)
         row = np.array([ways.first[i] + self.paths[i].index(e) for i, (e, _) in enumerate(self.at)])
         s = ways.begin[row] + [x for _, x in self.at]
-        zones = claims.zones(ways, along.net(self.net))
+        zones = interlocking.zones(ways, along.net(self.net))
         before = json.dumps(self.state)
         arrays = (row, s, self.length, self.present)
-        self.state, held, said = claims.claim(zones, self.state, *arrays, self.reach, self.clearance, **more)
+        self.state, held, said = interlocking.claim(zones, self.state, *arrays, self.reach, self.clearance, **more)
         assert json.loads(json.dumps(self.state)) == json.loads(json.dumps(self.state)) and before is not None
         self.state = json.loads(json.dumps(self.state))  # as a checkpoint keeps it
         return held, said
@@ -145,7 +145,7 @@ def test_turns_at_a_join_stay_and_those_of_one_track_keep_the_order_they_stand_i
     assert yard.state["joins"] == {m: [2, 0, 1]}
     ways = MERGE.ways(yard.paths)
     row, s = ways.first[:-1], np.array([x for _, x in yard.at])
-    here = along.places(ways, along.net(MERGE), row, s, yard.length, yard.present, 2000.0, claims.order(yard.state))
+    here = along.places(ways, along.net(MERGE), row, s, yard.length, yard.present, 2000.0, interlocking.order(yard.state))
     found = along.ahead(here)
     assert found.train.tolist() == [2, 0, -1, 1]
     assert found.spacing.tolist() == [160.0, -150.0, np.inf, 350.0]
@@ -208,14 +208,14 @@ def drive(net_of, routes, seed, n, limit=9000):
     kind = rng.integers(0, len(routes), n)
     ways = net_of.ways([[net_of.number[e] for e in routes[k].split()] for k in kind])
     net = along.net(net_of)
-    zones = claims.zones(ways, net)
+    zones = interlocking.zones(ways, net)
     length = rng.uniform(40.0, 480.0, n)
     departs = np.sort(rng.uniform(0.0, 900.0, n))
     acceleration, top = rng.uniform(0.2, 0.8, n), rng.uniform(10.0, TOP, n)
     end = ways.begin[ways.first[1:] - 1] + net_of.length_m[ways.edge[ways.first[1:] - 1]]
     row, s, v = ways.first[:-1].copy(), np.zeros(n), np.zeros(n)
     present, left = np.zeros(n, bool), np.zeros(n, bool)
-    state = claims.none()
+    state = interlocking.none()
     turns, passed = set(), {}
     for step in range(limit):
         for i in np.flatnonzero(~present & ~left & (departs <= step)).tolist():
@@ -223,8 +223,8 @@ def drive(net_of, routes, seed, n, limit=9000):
             if min(rest, default=np.inf) > length[i] + 20.0:
                 present[i], s[i] = True, length[i]
         reach = v**2 / (2 * BRAKING) + 3 * v + 2 * MARGIN
-        state, held, _ = claims.claim(zones, state, row, s, length, present, reach, 2 * MARGIN)
-        here = along.places(ways, net, row, s, length, present, 3000.0, claims.order(state))
+        state, held, _ = interlocking.claim(zones, state, row, s, length, present, reach, 2 * MARGIN)
+        here = along.places(ways, net, row, s, length, present, 3000.0, interlocking.order(state))
         room = np.minimum(along.obstacles(here, virtual=False).room, held.room) - MARGIN
         wanted = np.minimum(v + acceleration, top)
         stops = -BRAKING + np.sqrt(BRAKING**2 + 2 * BRAKING * np.maximum(room, 0.0))  # v^2 / 2b + v <= room

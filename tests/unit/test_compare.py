@@ -7,12 +7,12 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from trainctl.cli import app
+from trainctl.cli.program import app
 from trainctl.laws import laws
-from trainctl.prepare import prepare
-from trainctl.reading import examine, find, read
-from trainctl.record import compare
-from trainctl.record.compare import PANELS, alternatives, figures, names, table
+from trainctl.scenario.build import prepare
+from trainctl.scenario.reading import examine, find, read
+from trainctl.studies import compare
+from trainctl.studies.compare import PANELS, alternatives, figures, names, table
 
 
 @pytest.fixture(scope="module")

@@ -11,12 +11,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from sumo_net import Line, LineError
+from trainctl.diff.runs import diff
 from trainctl.errors import InputError
-from trainctl.prepare import open_scenario
-from trainctl.record.diff import diff
-from trainctl.record.metrics import metrics
-from trainctl.record.run import Run
-from trainctl.record.traffic import metrics_of_fcd
+from trainctl.metrics.run import metrics
+from trainctl.metrics.traffic import metrics_of_fcd
+from trainctl.runs.run import Run
+from trainctl.scenario.build import open_scenario
 
 
 @pytest.fixture

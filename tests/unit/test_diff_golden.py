@@ -11,11 +11,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from trainctl.diff.rows import compare
+from trainctl.diff.runs import EXACT, Tolerances
+from trainctl.diff.sources import Log
 from trainctl.errors import InputError
-from trainctl.record.diff import EXACT, Tolerances
-from trainctl.record.diff_rows import compare
-from trainctl.record.diff_sources import Log
-from trainctl.record.run import Run
+from trainctl.runs.run import Run
 from trainctl.testing import assert_run_matches, make_golden
 
 

@@ -19,8 +19,9 @@ import pytest
 import typer
 
 import sumo_net
-from trainctl import cli, sweep
-from trainctl.prepare import open_scenario
+from trainctl.cli import program as cli
+from trainctl.scenario.build import open_scenario
+from trainctl.studies import sweep
 
 ROOT = Path(__file__).parents[2]
 PAGES = ("README.md", "scenarios/README.md", "sumo_net/README.md", "sumo_net/OSM.md", "trainctl/controllers/README.md")

@@ -11,9 +11,9 @@ import pytest
 from scipy.io import loadmat
 
 from trainctl.errors import InputError
-from trainctl.record import export
-from trainctl.record.export import to_csv, to_mat
-from trainctl.record.run import Run
+from trainctl.runs import export
+from trainctl.runs.export import to_csv, to_mat
+from trainctl.runs.run import Run
 
 
 @pytest.fixture(scope="module")

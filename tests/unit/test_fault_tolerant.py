@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from trainctl.controllers import fault_tolerant as law
 from trainctl.observers import asymptotic
 from trainctl.plants import actuated_units as plant
-from trainctl.reference import constant, table
+from trainctl.scenario.reference import constant, table
 from trainctl.signals import Bounds, Consists, Links, Scene
 
 INF = math.inf

@@ -6,7 +6,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from trainctl.record.figures_sweep import summary
+from trainctl.figures.sweep import summary
 
 MARGIN = "bounds.spacing_lower_margin_m"
 

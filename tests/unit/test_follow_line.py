@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from trainctl.errors import InputError
-from trainctl.prepare import open_scenario
-from trainctl.reference import Profile, obeying, table
+from trainctl.scenario.build import open_scenario
+from trainctl.scenario.reference import Profile, obeying, table
 from trainctl.signals import leader_at
 
 LINE = """
@@ -169,8 +169,8 @@ def test_a_run_off_the_end_is_told(tmp_path):
 
 
 def test_slopes_change_the_input_of_point_trains_not_their_motion(tmp_path):
-    from trainctl.record.run import Run
     from trainctl.runner import run
+    from trainctl.runs.run import Run
 
     def rows(folder, gradient):
         folder.mkdir()

@@ -139,7 +139,7 @@ def test_a_file_that_is_not_there():
 
 
 def test_command_writes_a_line_that_builds(tmp_path, monkeypatch, capsys):
-    from trainctl.cli import main
+    from trainctl.cli.program import main
 
     (tmp_path / "track.json").write_text(json.dumps(track()))
 

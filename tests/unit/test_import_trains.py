@@ -11,7 +11,7 @@ import yaml
 from sumo_net.import_trains import fitted
 from sumo_net.importing import Options, convert
 from sumo_net.spec import LineError
-from trainctl.scenario import TrainType
+from trainctl.scenario.tables import TrainType
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 REAL = [

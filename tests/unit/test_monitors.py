@@ -12,14 +12,14 @@ import pytest
 from trainctl.controllers import emu_finite_time, fault_tolerant
 from trainctl.monitors.bounds import Alarms
 from trainctl.monitors.energy import Balance
-from trainctl.motion import Motion
 from trainctl.plants.coupled_units import PER_INERTIA
 from trainctl.plants.integrate import Extremes
-from trainctl.prepare import open_scenario
-from trainctl.record.journal import Row
+from trainctl.railway.ways import ways
 from trainctl.runner import opened
+from trainctl.scenario.build import open_scenario
 from trainctl.signals import POSITION, SPEED
-from trainctl.topology.ways import ways
+from trainctl.stages.plant import Motion
+from trainctl.stages.record import Row
 from trainctl.world import Seen
 
 

@@ -18,8 +18,8 @@ from trainctl.errors import InputError, LawError
 from trainctl.laws import find_law
 from trainctl.new import controller
 from trainctl.plants.integrate import described, part
-from trainctl.prepare import open_scenario
 from trainctl.runner import keep_law
+from trainctl.scenario.build import open_scenario
 
 BIN = Path(sys.executable).parent / "trainctl"
 

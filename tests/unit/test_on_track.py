@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from trainctl.monitors.on_track import Track, Watch, limits, overlaps, track
-from trainctl.topology.ways import ways
+from trainctl.railway.ways import ways
 from trainctl.world import Seen
 
 #: a (0) and b (1) follow each other, c (2) is b in the other direction; d (3) branches off a.

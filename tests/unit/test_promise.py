@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import tomli_w
 
-from trainctl import promise
-from trainctl.cli import main
+from trainctl.cli.program import main
 from trainctl.errors import InputError
-from trainctl.prepare import open_scenario
 from trainctl.runner import run
+from trainctl.scenario import promise
+from trainctl.scenario.build import open_scenario
 from trainctl.signals import GRAVITY
 
 LAW = '''

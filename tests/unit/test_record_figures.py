@@ -12,11 +12,11 @@ import tomli_w
 from matplotlib.figure import Figure
 
 from trainctl.errors import InputError
-from trainctl.record import style
-from trainctl.record.figures import FIGURES, PAPER, applicable, comparison, figure, plot, prepare
+from trainctl.figures import style
+from trainctl.figures.catalogue import FIGURES, PAPER, applicable, comparison, figure, plot, prepare
 from trainctl.record.folder import about_run, write_info
 from trainctl.record.recorder import UNIT_EXTRAS, Recorder, standard_tables
-from trainctl.record.run import Run
+from trainctl.runs.run import Run
 
 STEPS = 60
 

@@ -14,12 +14,12 @@ import pytest
 import tomli_w
 
 from trainctl.errors import InputError
+from trainctl.metrics.run import DEFINITIONS, metrics
+from trainctl.metrics.traffic import metrics_of_fcd
+from trainctl.metrics.values import base
 from trainctl.record.folder import about_run, write_info
-from trainctl.record.metrics import DEFINITIONS, metrics
 from trainctl.record.recorder import Recorder, standard_tables
-from trainctl.record.run import Run
-from trainctl.record.traffic import metrics_of_fcd
-from trainctl.record.values import base
+from trainctl.runs.run import Run
 
 NAN = float("nan")
 
@@ -306,7 +306,7 @@ def fcd_files(folder: Path) -> list[Path]:
 
 def test_any_kind_of_fcd_gives_the_same_metrics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for batch_rows in (65536, 2, 1):
-        monkeypatch.setattr("trainctl.record.sumo_logs.BATCH_ROWS", batch_rows)
+        monkeypatch.setattr("trainctl.runs.sumo_logs.BATCH_ROWS", batch_rows)
         for path in fcd_files(tmp_path):
             values = metrics_of_fcd(path)
             assert {name: pytest.approx(value) for name, value in values.items()} == {

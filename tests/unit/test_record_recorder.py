@@ -17,7 +17,7 @@ import pytest
 from trainctl.errors import InputError
 from trainctl.record.folder import about_run, claim, finish, partial_of, write_info
 from trainctl.record.recorder import Recorder, standard_tables
-from trainctl.record.run import Run
+from trainctl.runs.run import Run
 
 NAMES = ["1", "2", "10"]
 TABLES = standard_tables(NAMES, ["1", "2"], ["a", "b"], watched=["gap_m"])

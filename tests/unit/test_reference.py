@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from trainctl.reference import Profile, by_position, constant, s_curves, table
+from trainctl.scenario.reference import Profile, by_position, constant, s_curves, table
 from trainctl.signals import Reference, leader_at
 
 #: Fault-tolerant paper, sheet section 7: start, end, final speed.

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from trainctl.errors import InputError
-from trainctl.record.figures_trains import prepare
+from trainctl.figures.trains import prepare
 from trainctl.record.recorder import Recorder, standard_tables
-from trainctl.record.report import page, report
-from trainctl.record.report_animation import animation, frames
-from trainctl.record.report_panels import panels, told
-from trainctl.record.run import Run
+from trainctl.report.animation import animation, frames
+from trainctl.report.page import page, report
+from trainctl.report.panels import panels, told
+from trainctl.runs.run import Run
 
 
 def unpacked(packed):

@@ -13,7 +13,7 @@ from trainctl.controllers import robust_constrained as law
 from trainctl.controllers import robust_gain
 from trainctl.errors import InputError
 from trainctl.plants import disturbance
-from trainctl.reference import constant, table
+from trainctl.scenario.reference import constant, table
 from trainctl.signals import Bounds, Consists, Links, Scene, Trains
 
 LINE = [(0, 1), (1, 0), (1, 2), (2, 1), (2, 3), (3, 2)]

@@ -12,9 +12,9 @@ import pytest
 
 from sumo_net import Rails
 from trainctl.errors import InputError
-from trainctl.reading import examine
-from trainctl.roster import Roster, Stop, chart, enrol
-from trainctl.scenario import Scenario
+from trainctl.scenario.reading import examine
+from trainctl.scenario.roster import Roster, Stop, chart, enrol
+from trainctl.scenario.tables import Scenario
 
 Read = Callable[..., tuple[Scenario, Roster, Path]]
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from trainctl.prepare import open_scenario
-from trainctl.reading import _read, examine, load, shipped
-from trainctl.scenario import Scenario
+from trainctl.scenario.build import open_scenario
+from trainctl.scenario.reading import _read, examine, load, shipped
+from trainctl.scenario.tables import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "scenarios" / "README.md").read_text()

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import tomli_w
 
-from trainctl.prepare import Prepared, open_scenario
-from trainctl.service import Service
+from trainctl.scenario.build import Prepared, open_scenario
+from trainctl.stages.convoys import Service
 
 
 @pytest.fixture(scope="module")

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
-from trainctl import cli
+from trainctl.cli import program as cli
 from trainctl.errors import InputError
-from trainctl.prepare import open_scenario
-from trainctl.record import figures
-from trainctl.record.facts import facts
-from trainctl.record.figures_trains import MARKS, prepare
-from trainctl.record.report import page
-from trainctl.record.report_animation import animation
-from trainctl.record.run import Run
+from trainctl.figures import catalogue
+from trainctl.figures.trains import MARKS, prepare
+from trainctl.report.animation import animation
+from trainctl.report.page import page
 from trainctl.runner import run
+from trainctl.runs.known import facts
+from trainctl.runs.run import Run
+from trainctl.scenario.build import open_scenario
 from trainctl.sumo import gui
 from trainctl.sumo.replay import replay
 
@@ -54,7 +54,7 @@ def test_there_is_no_common_reference_but_a_cruising_speed(merging):
 
 
 def test_no_line_where_a_train_is_not_there_and_marks_where_something_happened(merging):
-    axes = figures.figure(merging, "train_graph").axes
+    axes = catalogue.figure(merging, "train_graph").axes
     assert len(axes) == 1
     first = merging.trains.astype({"train": str}).groupby("train")["time_s"].min()
     colour = {name: to_hex(c) for name, c in prepare(merging).colour.items()}

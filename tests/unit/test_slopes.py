@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import tomli_w
 
-from trainctl.prepare import open_scenario
+from trainctl.railway.ways import under, ways
 from trainctl.runner import run
+from trainctl.scenario.build import open_scenario
 from trainctl.signals import GRAVITY
-from trainctl.topology.ways import under, ways
 
 
 def test_a_train_over_two_edges_has_a_slope_under_each_unit():

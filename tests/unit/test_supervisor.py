@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from trainctl import supervisor
 from trainctl.plants import point
-from trainctl.supervisor import END, KINDS, LIMIT, OPPOSING, STOP, SWITCH, TRAIN, Limits, Params, Targets
+from trainctl.railway import supervisor
+from trainctl.railway.supervisor import END, KINDS, LIMIT, OPPOSING, STOP, SWITCH, TRAIN, Limits, Params, Targets
 
 PARAMS = Params(mode="on")  # 1.0, 0.7, 20 m
 NOBODY, NO_LIMIT = supervisor.no_targets(), supervisor.no_limits()

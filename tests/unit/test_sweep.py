@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from trainctl import sweep as sweeping
 from trainctl.errors import InputError, LawError
-from trainctl.sweep import Plan, half_width, jobs, prepared, seeds, sweep, values
-from trainctl.sweep_results import shares, wilson
+from trainctl.studies import sweep as sweeping
+from trainctl.studies.results import shares, wilson
+from trainctl.studies.sweep import Plan, half_width, jobs, prepared, seeds, sweep, values
 
 SHORT = {"run.duration_s": [20]}
 

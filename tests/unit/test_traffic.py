@@ -14,9 +14,9 @@ import pytest
 
 from sumo_net.build import program
 from trainctl.errors import InputError
-from trainctl.scenario import TrainType
-from trainctl.traffic import Traffic, read_traffic
-from trainctl.traffic_kinds import Kind, train_type
+from trainctl.scenario.tables import TrainType
+from trainctl.traffic.kinds import Kind, train_type
+from trainctl.traffic.read import Traffic, read_traffic
 
 NODES = """<nodes><node id="a" x="0" y="0"/><node id="b" x="2000" y="0"/><node id="c" x="4000" y="0"/><node id="d" x="7000" y="0"/>
 <node id="x" x="500" y="600"/><node id="z" x="500" y="900"/></nodes>"""

@@ -7,10 +7,10 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from trainctl.cli import main
+from trainctl.cli.program import main
 from trainctl.errors import InputError, SimulatorError
-from trainctl.prepare import open_scenario
 from trainctl.runner import run
+from trainctl.scenario.build import open_scenario
 from trainctl.sumo import gui
 from trainctl.sumo.replay import replay
 

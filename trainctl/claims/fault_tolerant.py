@@ -16,7 +16,7 @@ from trainctl.observers import asymptotic, intermediate
 from trainctl.plants import actuated_units as plant
 from trainctl.plants import integrate
 from trainctl.plants.faults import Fault, breaks
-from trainctl.reference import s_curves
+from trainctl.scenario.reference import s_curves
 from trainctl.signals import Bounds, Consists, Links, Scene
 
 CURVES = [

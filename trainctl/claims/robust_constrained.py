@@ -16,7 +16,7 @@ from trainctl.claims.claim import Claim, claim, span
 from trainctl.controllers import robust_constrained as law
 from trainctl.controllers import robust_gain, robust_theory
 from trainctl.plants import disturbance, point
-from trainctl.reference import constant
+from trainctl.scenario.reference import constant
 from trainctl.signals import POSITION, SPEED, Bounds, Consists, Floats, Links, Scene, Trains
 
 T, V0, SPACING, N = 0.8, 80.0, 8000.0, 4

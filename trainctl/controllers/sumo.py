@@ -75,7 +75,7 @@ def violations(params: Params, scene: Scene) -> list[str]:
 
 
 def unfit(scenario: Any) -> list[str]:
-    """Parts of a ``scenario`` (``trainctl.scenario.Scenario``) that SUMO's own trains would not feel."""
+    """Parts of a ``scenario`` (``trainctl.scenario.tables.Scenario``) that SUMO's own trains would not feel."""
     found = [f"{key}: SUMO's own trains take none" for key in ("disturbance", "fault") if getattr(scenario, key)]
     given, network = scenario.controller.keys(), scenario.network
     if network.line is None and given.get("signals_m") is not None:

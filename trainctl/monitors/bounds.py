@@ -22,12 +22,12 @@ from trainctl.monitors.waiting import Wait, Waiting
 from trainctl.signals import Floats, Ints
 
 if TYPE_CHECKING:
-    from trainctl.lookout import View
-    from trainctl.prepare import Prepared
-    from trainctl.record.journal import Row
-    from trainctl.service import Service
-    from trainctl.topology.claims import Held
-    from trainctl.topology.ways import Ways
+    from trainctl.railway.authority import View
+    from trainctl.railway.interlocking import Held
+    from trainctl.railway.ways import Ways
+    from trainctl.scenario.build import Prepared
+    from trainctl.stages.convoys import Service
+    from trainctl.stages.record import Row
     from trainctl.world import Seen
 
 Alarm = dict[str, Any]

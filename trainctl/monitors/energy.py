@@ -10,8 +10,8 @@ import numpy as np
 from trainctl.signals import POSITION, SPEED, Floats
 
 if TYPE_CHECKING:
-    from trainctl.prepare import Prepared
-    from trainctl.record.journal import Row
+    from trainctl.scenario.build import Prepared
+    from trainctl.stages.record import Row
 
 #: Signs of ``signals.POWERS`` in the balance.
 SIGNS = np.array([1.0, -1.0, -1.0, -1.0, -1.0, 1.0])

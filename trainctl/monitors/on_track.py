@@ -14,11 +14,11 @@ from numba import njit
 
 from sumo_net import Line, Rails
 from trainctl.kernels import keep_by_sources
+from trainctl.railway.ways import Ways
 from trainctl.signals import Bools, Floats, Ints
-from trainctl.topology.ways import Ways
 
 if TYPE_CHECKING:
-    from trainctl.prepare import Prepared
+    from trainctl.scenario.build import Prepared
     from trainctl.world import Seen
 
 keep_by_sources()  # before anything below is decorated

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from trainctl import lookout, supervisor
+from trainctl.railway import authority, supervisor
 from trainctl.signals import Bools, Floats
 
 if TYPE_CHECKING:
-    from trainctl.lookout import View
-    from trainctl.service import Service
-    from trainctl.topology.claims import Held
+    from trainctl.railway.authority import View
+    from trainctl.railway.interlocking import Held
+    from trainctl.stages.convoys import Service
     from trainctl.world import Seen
 
 #: Slower than this a train stands [m/s].
@@ -57,7 +57,7 @@ def waits(
     rules, assumed : Params, Assumed
         By which whoever starts them judges, and what is relied on.
     step, theta : float
-        Step [s] and lead of the plant, as ``lookout.judge`` takes them.
+        Step [s] and lead of the plant, as ``authority.judge`` takes them.
     own_stop : ndarray, shape (n,)
         Trains that stand at their own stops: they wait for nobody.
     """
@@ -66,9 +66,9 @@ def waits(
         return []
     found, none = [], np.zeros_like(speed)
     for switch in (False, True):  # a train may be kept by both, then it needs both
-        parts = [lookout.of(t, stand[t.train] & ((t.other < 0) == switch)) for t in (view.targets, view.clear)]
+        parts = [authority.of(t, stand[t.train] & ((t.other < 0) == switch)) for t in (view.targets, view.clear)]
         targets, clear = parts[0], parts[0] if view.targets is view.clear else parts[1]
-        verdict = lookout.judge(rules, none, targets, clear, supervisor.no_limits(), step, theta, assumed, none)
+        verdict = authority.judge(rules, none, targets, clear, supervisor.no_limits(), step, theta, assumed, none)
         others = np.concatenate([targets.other, clear.other])
         for i in np.flatnonzero(stand & (verdict.reason >= 0) & (verdict.greatest * step < STANDS_MPS)).tolist():
             if switch:

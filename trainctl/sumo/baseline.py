@@ -21,22 +21,22 @@ from typing import Any, NamedTuple
 import libsumo
 import numpy as np
 
-from trainctl import supervisor
 from trainctl.controllers.sumo import BRAKING_MPS2
 from trainctl.errors import CouplingError, InputError, SimulatorError
+from trainctl.metrics.run import metrics
 from trainctl.monitors import on_track
 from trainctl.monitors.outcome import Tally
 from trainctl.plants import point
-from trainctl.prepare import Prepared
+from trainctl.railway import supervisor
+from trainctl.railway.ways import rerouted, ways
 from trainctl.record.folder import about_run, claim, finish, held, remove, write_info, write_json
-from trainctl.record.metrics import metrics
 from trainctl.record.recorder import ENERGIES, Recorder, standard_tables
-from trainctl.record.run import Run
-from trainctl.reroute import Reroutes
+from trainctl.runs.run import Run
+from trainctl.scenario.build import Prepared
 from trainctl.signals import GRAVITY, POWERS, Bools, Floats, Ints
+from trainctl.stages.orders import Reroutes
 from trainctl.sumo.baseline_files import departures, network, write_configuration, write_routes
 from trainctl.sumo.session import LOGS, TOLERANCE_M, collisions, messages, normal
-from trainctl.topology.ways import rerouted, ways
 from trainctl.world import Seen
 
 #: A bound counts as broken beyond this.

@@ -13,7 +13,7 @@ from sumo_net import Line, LineError
 from sumo_net.netfile import content, unpack
 from trainctl.controllers.sumo import SIGNALS_M
 from trainctl.errors import InputError
-from trainctl.prepare import Prepared
+from trainctl.scenario.build import Prepared
 from trainctl.signals import SPEED, Floats
 from trainctl.sumo.session import OPTIONS, fcd_period, normal
 

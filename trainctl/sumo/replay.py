@@ -14,10 +14,10 @@ import pyarrow.parquet as pq
 import sumo_net
 from sumo_net import Line, LineError, Rails
 from trainctl.errors import InputError, SimulatorError
-from trainctl.reading import examine
-from trainctl.record.run import Run
-from trainctl.roster import chart
-from trainctl.scenario import Scenario
+from trainctl.runs.run import Run
+from trainctl.scenario.reading import examine
+from trainctl.scenario.roster import chart
+from trainctl.scenario.tables import Scenario
 from trainctl.signals import Bools, Floats, Ints, Links
 from trainctl.sumo.gui import Gui, Map
 from trainctl.topology import graph

@@ -22,10 +22,10 @@ import numpy as np
 
 from sumo_net import Line
 from trainctl.errors import CouplingError, SimulatorError
-from trainctl.record.sumo_logs import elements
+from trainctl.railway.ways import rerouted
+from trainctl.runs.sumo_logs import elements
 from trainctl.signals import Bools, Floats, Ints, Links
 from trainctl.sumo.preflight import objections
-from trainctl.topology.ways import rerouted
 from trainctl.world import Seen, Start, lay_out
 
 #: Speed mode 32 switches off every speed correction of SUMO's; each inserted train starts with all of them on (31).

@@ -1,0 +1,111 @@
+"""What all commands share: the application, its options in common, and printing. Heavy modules are imported where they are used."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from trainctl.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from trainctl.scenario.build import Prepared
+
+DEFAULT_SCENARIO = "three_tracks"
+
+
+app = typer.Typer(
+    name="trainctl",
+    help="Closed-loop testbed for cooperative train control on SUMO rail networks.\n\n"
+    "Try `trainctl run`, then `trainctl plot runs/three_tracks`. Scenarios are TOML files: `trainctl list` names those that come "
+    "with the package, `trainctl schema` describes every key.\n\n"
+    "Exit codes: 0 done, 1 a check failed, 2 bad input, 3 the run failed, 130 interrupted.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+networks = typer.Typer(help="Rail networks: list, build, show.", no_args_is_help=True)
+app.add_typer(networks, name="net")
+
+
+ScenarioName = Annotated[str, typer.Argument(help="Name of a shipped scenario (see `trainctl list`) or path of a scenario TOML.")]
+RunFolder = Annotated[Path, typer.Argument(help="Run folder, as `trainctl run` made it.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")]
+Settings = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key, e.g. --set run.duration_s=60. Repeatable.")
+]
+
+
+def named(name: str, settings: list[str] | None) -> Prepared:
+    """The scenario of that name, with these settings."""
+    from trainctl.scenario.build import open_scenario
+
+    return open_scenario(name, dict(map(setting, settings or [])))
+
+
+def setting(text: str) -> tuple[str, Any]:
+    """Key and value of a ``--set``."""
+    import tomllib
+
+    key, equals, value = text.partition("=")
+    if not equals or not key:
+        raise InputError(f"--set {text}: must be KEY=VALUE")
+    try:
+        return key, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key, value  # a bare word is text
+
+
+def listing(title: str | None, *columns: str) -> Table:
+    """An empty table."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    for k, column in enumerate(columns):
+        table.add_column(column, overflow="fold", no_wrap=k == 0)
+    return table
+
+
+def show(*things: Any) -> None:
+    """Print tables and text."""
+    from rich.console import Console
+
+    Console(width=None if sys.stdout.isatty() else 120, highlight=False).print(*things)
+
+
+def show_json(value: Any) -> None:
+    """Print for machines."""
+    from trainctl.record.folder import plain
+
+    print(json.dumps(plain(value), indent=2))
+
+
+class Progress:
+    """A progress bar on stderr, or nothing."""
+
+    def __init__(self, title: str, shown: bool) -> None:
+        self.title, self.shown = title, shown
+
+    def __enter__(self) -> Callable[[int, int], None]:
+        if not self.shown:
+            return lambda done, steps: None
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+        from rich.progress import Progress as Bar
+
+        columns = (TextColumn(self.title), BarColumn(), MofNCompleteColumn(), TextColumn("steps"), TimeRemainingColumn())
+        self.bar = Bar(*columns, console=Console(stderr=True), transient=True)
+        self.bar.start()
+        task = self.bar.add_task("", total=None)
+        return lambda done, steps: self.bar.update(task, completed=done, total=steps)
+
+    def __exit__(self, *_: object) -> None:
+        if self.shown:
+            self.bar.stop()

@@ -1,0 +1,293 @@
+"""The command line. Heavy modules are imported inside the commands: ``trainctl --help`` answers at once."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from trainctl.cli import diff, extend, net, report, resume, sweep
+from trainctl.cli.console import (
+    DEFAULT_SCENARIO,
+    Json,
+    Progress,
+    RunFolder,
+    ScenarioName,
+    Settings,
+    app,
+    listing,
+    named,
+    networks,
+    show,
+    show_json,
+)
+from trainctl.errors import InputError, TrainctlError
+
+if TYPE_CHECKING:
+    from trainctl.runs.run import Run
+    from trainctl.scenario.build import Prepared
+
+
+@app.command()
+def run(
+    name: ScenarioName = DEFAULT_SCENARIO,
+    out: Annotated[Path | None, typer.Option(help="Run folder; default runs/NAME. A run of ours there is replaced.")] = None,
+    backend: Annotated[Literal["sumo", "numeric"], typer.Option(help="SUMO, or the same loop without a simulator.")] = "sumo",
+    gui: Annotated[bool, typer.Option("--gui", help="Watch the run in sumo-gui: tracks, trains by role, links.")] = False,
+    gui_program: Annotated[str, typer.Option(help="The program --gui starts; sumo is the same without a window.")] = "sumo-gui",
+    checkpoint_every: Annotated[
+        float | None, typer.Option(help="Scenario time between two checkpoints [s]; `trainctl resume` goes on from the last one.")
+    ] = None,
+    record_every: Annotated[
+        float | None,
+        typer.Option(help="Time between recorded rows [s], SUMO's FCD included; default every step."),
+    ] = None,
+    settings: Settings = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace whatever lies at the run folder.")] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if any bound was broken.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no summary.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Run a scenario into a run folder: logs, metrics, SUMO's own logs.
+
+    Exit 1 if trains collided or waited for each other in a circle; with the supervisor on also if one was too fast for its line.
+    """
+    from trainctl import runner
+
+    if gui and backend == "numeric":
+        raise InputError("--gui: shows SUMO; leave out --backend numeric")
+    if record_every is not None:
+        settings = [*(settings or []), f"run.record_every_s={record_every!r}"]
+    prepared = named(name, settings)
+    folder = out if out is not None else Path("runs") / Path(name).stem
+    shown = not (quiet or as_json)
+    with Progress(f"{Path(name).stem}", shown and sys.stderr.isatty()) as advance:
+        done = runner.run(prepared, folder, backend, force, sys.argv, advance, gui_program if gui else None, checkpoint_every)
+    if as_json:
+        show_json({"folder": str(folder), **done.info, "metrics": done.metrics})
+    elif shown:
+        _summary(done, prepared)
+    if not done.ok or (strict and done.info["violations"]):
+        raise typer.Exit(1)
+
+
+def _summary(done: Run, prepared: Prepared) -> None:
+    """Where the results lie, and whether the bounds held."""
+    from trainctl.runs.outcome import summary
+
+    info, metrics = done.info, done.metrics
+    print(prepared.scenario.title)
+    table = listing(None, "", "")
+    table.show_header = False
+    law = prepared.scenario.controller.law
+    table.add_row(
+        "law, plant", f"{law} on {prepared.scenario.plant.kind}, {len(prepared.scenario.train)} trains, backend {info['backend']}"
+    )
+    table.add_row("steps", f"{info['steps']} of {prepared.scenario.run.step_s:g} s in {info['wall_time_s']:.1f} s")
+    for key, words, unit in (
+        ("bounds.spacing_lower_margin_m", "least spacing above its lower bound", "m"),
+        ("bounds.spacing_upper_margin_m", "least room below the upper spacing bound", "m"),
+        ("bounds.speed_lower_margin_mps", "least speed above its lower bound", "m/s"),
+        ("bounds.speed_upper_margin_mps", "least room below the upper speed bound", "m/s"),
+        ("bounds.input_lower_margin_mps2", "least input above its lower bound", "m/s2"),
+        ("bounds.input_upper_margin_mps2", "least room below the upper input bound", "m/s2"),
+        ("formation.settling_s", "all links within 1 m from", "s"),
+        ("formation.final_error_m", "largest spacing error at the end", "m"),
+    ):
+        if isinstance(metrics.get(key), int | float):
+            table.add_row(words, f"{metrics[key]:.6g} {unit}")
+    for line in summary(done):
+        table.add_row(line.title, f"FAILED: {line.text}" if line.failed else line.text)
+    table.add_row("results", f"{done.folder}/  (trainctl plot {done.folder}; trainctl metrics {done.folder})")
+    show(table)
+    for note in () if prepared.roster is None else prepared.roster.notes:
+        print(f"warning: {note}")
+
+
+@app.command("list")
+def list_(as_json: Json = False) -> None:
+    """List the scenarios that come with the package."""
+    from trainctl.scenario.reading import read, shipped
+
+    rows = []
+    for name in shipped():
+        data, path = read(name)
+        rows.append({"name": name, "law": data["controller"]["law"], "title": data["title"], "file": str(path)})
+    if as_json:
+        show_json(rows)
+        return
+    table = listing(None, "name", "law", "title")
+    for row in rows:
+        table.add_row(row["name"], row["law"], row["title"])
+    show(table)
+
+
+@app.command()
+def check(name: ScenarioName = DEFAULT_SCENARIO, settings: Settings = None, as_json: Json = False) -> None:
+    """Check a scenario without running it: every mistake, every assumption of its law, and what follows from them."""
+    prepared = named(name, settings)
+    from trainctl.scenario.check import facts
+
+    found = facts(prepared)
+    if as_json:
+        show_json(found)
+        return
+    print(f"{prepared.file}: no mistakes, no start condition of {prepared.scenario.controller.law} broken")
+    table = listing(None, "", "")
+    table.show_header = False
+    for key, value in found.items():
+        if key not in ("warnings", "report", "analysis", "protection", "promise"):
+            table.add_row(key, str(value))
+    show(table)
+    for k, line in enumerate(found.get("promise", ())):
+        print(f"protection: {line}" if not k else f"  - {line}")
+    for line in found["report"]:
+        print(line)
+    for line in found["warnings"]:
+        print(f"warning: {line}")
+
+
+@app.command()
+def metrics(
+    folder: Annotated[
+        Path | None, typer.Argument(help="Run folder, or an FCD file of SUMO's (.xml, .xml.gz, .csv, .parquet).")
+    ] = None,
+    band_m: Annotated[float, typer.Option(help="Band for settling of spacings [m].")] = 1.0,
+    section_m: Annotated[float | None, typer.Option(help="Kilometrage at which trains are counted [m].")] = None,
+    everything: Annotated[bool, typer.Option("--all", help="Also the values of each train, link and unit.")] = False,
+    names: Annotated[bool, typer.Option("--list", help="List all metrics with units and definitions.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Compute the metrics of a run, or of any SUMO FCD file."""
+    from trainctl.metrics import run as measured
+
+    if names:
+        if as_json:
+            show_json({key: {"unit": unit, "definition": text} for key, (unit, text) in measured.DEFINITIONS.items()})
+            return
+        table = listing(None, "metric", "unit", "definition")
+        for key, (unit, text) in measured.DEFINITIONS.items():
+            table.add_row(key, unit, text)
+        show(table)
+        return
+    if folder is None:
+        raise InputError("metrics: give a run folder or an FCD file, or --list")
+    if folder.is_dir():
+        from trainctl.runs.run import Run
+
+        values = measured.metrics(Run(folder), band_m=band_m, section_m=section_m)
+    else:
+        from trainctl.metrics.traffic import metrics_of_fcd
+
+        values = metrics_of_fcd(folder)
+    if as_json:
+        show_json(values)
+        return
+    table = listing(str(folder), "metric", "value", "unit")
+    for key, value in values.items():
+        if everything or "/" not in key:
+            unit = measured.DEFINITIONS.get(key.partition("/")[0], ("", ""))[0]
+            table.add_row(key, f"{value:.6g}" if isinstance(value, float) else str(value), unit)
+    show(table)
+
+
+@app.command()
+def plot(
+    folder: RunFolder,
+    out: Annotated[Path | None, typer.Option(help="Where the figures go; default FOLDER/figures.")] = None,
+    formats: Annotated[list[str] | None, typer.Option("--format", help="png, svg, pdf; repeatable; default png.")] = None,
+    width: Annotated[Literal["single", "double"], typer.Option(help="A column of print (85 mm) or a page (178 mm).")] = "double",
+) -> None:
+    """Draw all figures that apply to a run."""
+    from trainctl.figures.catalogue import plot as draw
+    from trainctl.runs.run import Run
+
+    wanted = tuple(formats or ("png",))
+    wrong = [f for f in wanted if f not in ("png", "svg", "pdf")]
+    if wrong:
+        raise InputError([f"--format {f}: must be one of png, svg, pdf" for f in wrong])
+    for path in draw(Run(folder), out or folder / "figures", wanted, width):
+        print(path)
+
+
+@app.command()
+def schema(
+    law: Annotated[str | None, typer.Option(help="Also the keys of this law's [controller] table.")] = None,
+) -> None:
+    """Print the JSON Schema of scenario files."""
+    from trainctl.laws import find_law, laws
+    from trainctl.scenario.tables import Scenario
+
+    if law is not None:
+        show_json(find_law(law).Params.model_json_schema())
+        return
+    found = Scenario.model_json_schema()
+    found["x-laws"] = {name: find_law(name).Params.model_json_schema() for name in laws()}
+    show_json(found)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"trainctl {version('trainctl')}, SUMO {version('libsumo')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Versions of trainctl and SUMO.")
+    ] = False,
+) -> None:
+    """Closed-loop testbed for cooperative train control on SUMO rail networks."""
+
+
+diff.register(app)
+extend.register(app)
+net.register(networks)
+report.register(app)
+resume.register(app)
+sweep.register(app)
+
+
+def _tell(lines: Iterable[str]) -> None:
+    for line in lines:
+        print(line, file=sys.stderr)
+
+
+def main() -> None:
+    """Entry point: every error of ours is one line per mistake and an exit code, never a traceback."""
+    try:
+        code = app(standalone_mode=False)
+        if code == 130:  # the command line parser has swallowed the interrupt
+            _tell(["trainctl: interrupted"])
+        sys.exit(code if isinstance(code, int) else 0)
+    except SystemExit as end:
+        if isinstance(end.__context__, BrokenPipeError):  # which the parser turns into 1
+            sys.exit(3)
+        raise
+    except InputError as error:
+        _tell(error.mistakes)
+        sys.exit(error.exit_code)
+    except TrainctlError as error:
+        _tell([f"trainctl: {error}"])
+        sys.exit(error.exit_code)
+    except (KeyboardInterrupt, typer.Abort):
+        _tell(["trainctl: interrupted"])
+        sys.exit(130)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(3)
+    except OSError as error:
+        _tell([f"trainctl: {error}"])
+        sys.exit(3)
+    except Exception as error:
+        if not hasattr(error, "format_message"):  # not one of the command line parser's own
+            raise
+        error.show()  # type: ignore[attr-defined]
+        sys.exit(2)

@@ -1,0 +1,228 @@
+"""Commands that show results: ``report``, ``compare``, ``claims``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from trainctl.errors import InputError
+
+if TYPE_CHECKING:
+    from trainctl.runs.run import Run
+
+
+CAPACITY = "compare capacity"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the command line."""
+    app.command()(report)
+    app.command()(compare)
+    app.command()(claims)
+
+
+def report(
+    folder: Annotated[Path, typer.Argument(help="Run folder, as `trainctl run` made it.")],
+    out: Annotated[Path | None, typer.Option(help="The page; default FOLDER/report.html.")] = None,
+) -> None:
+    """Write one self-contained page about a run: verdicts, the trains on their tracks, linked plots."""
+    from trainctl.report.page import report as write
+    from trainctl.runs.run import Run
+
+    print(write(Run(folder), out))
+
+
+def compare(
+    names: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="RUN...",
+            help="Run folders; with --controllers all one scenario; or the word capacity (./capacity is a folder).",
+        ),
+    ],
+    controllers: Annotated[
+        Literal["all"] | None, typer.Option(help="all: run the scenario under every law that can drive its traffic, and compare.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Where figures and runs go; default runs/compare, with capacity runs/capacity.")
+    ] = None,
+    backend: Annotated[Literal["sumo", "numeric"], typer.Option(help="With --controllers: SUMO, or the loop without it.")] = "sumo",
+    formats: Annotated[list[str] | None, typer.Option("--format", help="png, svg, pdf; repeatable; default png.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="With --controllers: override a key of the scenario.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")] = False,
+    trains: Annotated[int | None, typer.Option(help="Trains; default 40.", rich_help_panel=CAPACITY)] = None,
+    length_km: Annotated[float | None, typer.Option(help="Measured stretch in km; default 100.", rich_help_panel=CAPACITY)] = None,
+    speed_mps: Annotated[float | None, typer.Option(help="Line speed in m/s; default 83.333.", rich_help_panel=CAPACITY)] = None,
+    signals_m: Annotated[float | None, typer.Option(help="Blocks in m; default 2000.", rich_help_panel=CAPACITY)] = None,
+    spacing_m: Annotated[
+        float | None, typer.Option(help="Desired spacing of the formations in m; default 3000.", rich_help_panel=CAPACITY)
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Runs at a time; default one per core.", rich_help_panel=CAPACITY)
+    ] = None,
+) -> None:
+    """Compare runs: one table, figures side by side.
+
+    `trainctl compare capacity` runs the same trains on the same line under SUMO's fixed block and moving block and under every law:
+    headway, trains per hour, journey time, energy, collisions.
+    """
+    from trainctl.cli.console import listing, show, show_json
+    from trainctl.runs.run import Run
+    from trainctl.studies import compare as comparing
+
+    wanted = tuple(formats or ("png",))
+    wrong = [f for f in wanted if f not in ("png", "svg", "pdf")]
+    if wrong:
+        raise InputError([f"--format {f}: must be one of png, svg, pdf" for f in wrong])
+    plan = {
+        "trains": trains, "length_m": None if length_km is None else 1000.0 * length_km, "speed_mps": speed_mps,
+        "signals_m": signals_m, "spacing_m": spacing_m,
+    }  # fmt: skip
+    if names == ["capacity"] and controllers is None:
+        if settings or backend != "sumo":
+            raise InputError("capacity: takes no --set and no --backend; its scenarios lie in --out afterwards")
+        chosen = {key: value for key, value in plan.items() if value is not None}
+        _capacity(chosen, out or Path("runs/capacity"), wanted, workers, as_json)
+        return
+    given = {"workers": workers, "trains": trains, "length-km": length_km, "speed-mps": speed_mps, "signals-m": signals_m}
+    given["spacing-m"] = spacing_m
+    if idle := [f"--{key}: only with `trainctl compare capacity`" for key, value in given.items() if value is not None]:
+        raise InputError(idle)
+    out = out or Path("runs/compare")
+    left_out: dict[str, list[str]] = {}
+    if controllers is None:
+        if settings:
+            raise InputError("--set: only with --controllers all, which runs something")
+        runs = [Run(Path(name)) for name in names]
+        labels = comparing.names(runs)
+    else:
+        if len(names) != 1:
+            raise InputError("--controllers all: give exactly one scenario")
+        runs, labels, left_out = _under_all(names[0], out, backend, settings)
+    rows = comparing.table(runs)
+    figures = comparing.figures(runs, labels, out, wanted)
+    if as_json:
+        show_json({"runs": labels, "rows": rows, "left_out": left_out, "figures": figures})
+        return
+    table = listing(None, "metric", *(label.replace("_", " ") for label in labels), "unit")
+    for row in rows:
+        table.add_row(row["metric"], *(_shown(value) for value in row["values"]), row["unit"])
+    show(table)
+    for name, reasons in left_out.items():
+        for reason in reasons:
+            print(f"{name} is left out: {reason}")
+    for path in figures:
+        print(path)
+
+
+def _capacity(given: dict[str, Any], out: Path, formats: tuple[str, ...], workers: int | None, as_json: bool) -> None:
+    """Run, measure and show how much a line carries; rows that failed are told and make the exit code 3."""
+    import sys
+
+    from rich.markup import escape
+
+    from trainctl.cli.console import Progress, listing, show, show_json
+    from trainctl.studies import capacity
+
+    plan = capacity.Plan(**given)
+    with Progress("capacity", sys.stderr.isatty()) as advance:
+        table = capacity.compare(plan, out, workers=workers, progress=advance)
+    pictures = capacity.figure(table, plan, out / "capacity", formats)
+    if as_json:
+        show_json(table)
+    else:
+        km, kmh = plan.length_m / 1000.0, 3.6 * plan.speed_mps
+        shown = listing(f"{plan.trains} trains over {km:g} km at {kmh:.3g} km/h at most", *map(escape, capacity.COLUMNS))
+        for row in table:
+            shown.add_row(row["row"].replace("_", " "), *(_shown(row[key]) for key in list(capacity.COLUMNS.values())[1:]))
+        show(shown)
+        for path in pictures:
+            print(path)
+    failed = [f"{row['row']}: {row['error']}" for row in table if row["error"]]
+    for line in failed:
+        print(line, file=sys.stderr)
+    if failed:
+        raise typer.Exit(3)
+
+
+def _under_all(
+    name: str, out: Path, backend: Literal["sumo", "numeric"], settings: list[str] | None
+) -> tuple[list[Run], list[str], dict[str, list[str]]]:
+    """Run one scenario under every law; the runs, their names, and who could not and why."""
+    import sys
+
+    from trainctl import runner
+    from trainctl.cli.console import Progress, setting
+    from trainctl.errors import TrainctlError
+    from trainctl.laws import laws
+    from trainctl.scenario.build import prepare
+    from trainctl.scenario.reading import examine, read
+    from trainctl.studies import compare as comparing
+
+    data, path = read(name, dict(map(setting, settings or [])))
+    runs, labels, left_out = [], [], {}
+    for law, changed in comparing.alternatives(data, laws()).items():
+        try:
+            scenario, found = examine(changed)
+            if scenario is None:
+                raise InputError(found)
+            prepared = prepare(scenario, path.name, path.parent, found)
+            with Progress(law, sys.stderr.isatty()) as advance:
+                runs.append(runner.run(prepared, out / law, backend, False, sys.argv, advance))
+            labels.append(law)
+        except InputError as error:
+            left_out[law] = list(error.mistakes)
+        except TrainctlError as error:
+            left_out[law] = [f"the run failed: {error}"]
+    if not runs:
+        raise InputError([f"{law}: {reason}" for law, reasons in left_out.items() for reason in reasons])
+    return runs, labels, left_out
+
+
+def _shown(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
+def claims(
+    paper: Annotated[str | None, typer.Option(help="Only this paper (see the first column).")] = None,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print JSON: paper, claim, paper_value, measured, unit, verdict, note.")
+    ] = False,
+) -> None:
+    """Measure every claim of the papers: what they state, what comes out here, the verdict and the correction."""
+    import sys
+
+    from trainctl.claims import NOT, PAPERS, REPRODUCED, WITH_CORRECTION, as_markdown, measure
+    from trainctl.cli.console import Progress, listing, show, show_json
+
+    if paper is not None and paper not in PAPERS:
+        raise InputError(f"--paper {paper}: not known; there are: {', '.join(PAPERS)}")
+    with Progress("claims", sys.stderr.isatty()) as advance:
+        found = measure([paper] if paper else list(PAPERS), advance)
+    if as_json:
+        show_json([claim._asdict() for claim in found])
+    elif markdown:
+        print(as_markdown(found))
+    else:
+        from rich.text import Text
+
+        colours = {REPRODUCED: "green", WITH_CORRECTION: "yellow", NOT: "red"}
+        for name in dict.fromkeys(claim.paper for claim in found):
+            table = listing(f"{name}: {PAPERS[name]}")
+            for column, share in (("claim", 5), ("paper", 2), ("measured", 2), ("unit", None), ("verdict", None), ("note", 5)):
+                table.add_column(column, ratio=share, overflow="fold")
+            for claim in found:
+                if claim.paper == name:
+                    cells = [Text(_shown(value)) for value in claim[1:]]
+                    cells[4].stylize(colours[claim.verdict])
+                    table.add_row(*cells)
+            show(table)
+        counts = [f"{sum(c.verdict == verdict for c in found)} {verdict}" for verdict in (REPRODUCED, WITH_CORRECTION, NOT)]
+        print(f"{len(found)} claims: {', '.join(counts)}")

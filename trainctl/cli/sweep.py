@@ -1,0 +1,147 @@
+"""``trainctl sweep``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from trainctl.errors import InputError
+
+if TYPE_CHECKING:
+    from trainctl.studies.sweep import Plan
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+
+    @app.command()
+    def sweep(
+        name: Annotated[str, typer.Argument(help="Scenario, or a ready-made sweep such as monte_carlo: name or path of a TOML.")],
+        settings: Annotated[
+            list[str] | None,
+            typer.Option("--set", metavar="KEY=A,B,...", help="Values of a key; several --set are combined, each with each."),
+        ] = None,
+        seeds: Annotated[str | None, typer.Option(metavar="0..99", help="Seeds; each combination runs with each of them.")] = None,
+        jitter: Annotated[
+            list[str] | None,
+            typer.Option(
+                metavar="train.KEY=W", help="Move a number of every train by up to W either way, by the seed. Repeatable."
+            ),
+        ] = None,
+        out: Annotated[Path | None, typer.Option(help="Folder of the sweep; default sweeps/NAME.")] = None,
+        workers: Annotated[int | None, typer.Option(min=1, help="Processes on this machine; default one per core.")] = None,
+        scheduler: Annotated[
+            str | None, typer.Option(metavar="ADDRESS", help="A running Dask scheduler instead: tcp://..., or its .json file.")
+        ] = None,
+        backend: Annotated[Literal["sumo", "numeric"], typer.Option(help="SUMO, or the same loop without a simulator.")] = "sumo",
+        resume: Annotated[bool, typer.Option("--resume", help="Go on with the sweep in --out; what is done stays.")] = False,
+        force: Annotated[bool, typer.Option("--force", help="Replace whatever lies at --out.")] = False,
+        keep: Annotated[
+            bool, typer.Option("--keep", help="Keep all run folders in OUT/runs (workers need the same file system).")
+        ] = False,
+        strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if any run broke a bound.")] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no summary.")] = False,
+        as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")] = False,
+    ) -> None:
+        """Run a scenario with many settings and seeds, on all cores or a cluster, into one Parquet dataset.
+
+        OUT gets results.parquet (one row per run: parameters, status, what was broken, metrics), summary.png and sweep.json. Exit 3
+        if runs failed; the others are there all the same. A collision is a result of its run, not a failed run.
+        """
+        from trainctl.cli.console import show_json
+        from trainctl.studies import sweep as sweeping
+
+        plan = _plan(name, settings, seeds, jitter, backend)
+        if resume and force:
+            raise InputError("--resume and --force: one goes on with what is there, the other removes it")
+        folder = out if out is not None else Path("sweeps") / Path(name).stem
+        with _Progress(Path(name).stem, not quiet and not as_json) as progress:
+            info = sweeping.sweep(
+                plan, folder, workers=workers, scheduler=scheduler, resume=resume, force=force, keep=keep, command_line=sys.argv,
+                progress=progress,
+            )  # fmt: skip
+        if as_json:
+            show_json({"folder": str(folder), **info})
+        elif not quiet:
+            _summary(folder, info)
+        if info["failed"]:
+            raise typer.Exit(3)
+        if strict and info["violated"]["runs"]:
+            raise typer.Exit(1)
+
+
+def _plan(name: str, settings: list[str] | None, seeds: str | None, jitter: list[str] | None, backend: str) -> Plan:
+    """What the command line asks for, laid over a ready-made sweep."""
+    from trainctl.studies import sweep as sweeping
+
+    made = sweeping.ready_made(name) or sweeping.Plan(name, {}, [], {})
+    axes = {**made.settings, **dict(map(sweeping.values, settings or []))}
+    if seeds is not None:
+        axes.pop("run.seed", None)
+    wanted = sweeping.seeds(seeds) if seeds is not None else made.seeds
+    return sweeping.Plan(made.scenario, axes, wanted, {**made.jitter, **dict(map(sweeping.half_width, jitter or []))}, backend)
+
+
+class _Progress:
+    """How far the sweep is, on stderr: a bar on a terminal, else a line every tenth."""
+
+    def __init__(self, title: str, shown: bool) -> None:
+        self.title, self.shown = title, shown
+        self.bar: Any = None
+
+    def __enter__(self) -> Any:
+        if self.shown and sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+            columns = (
+                TextColumn(self.title), BarColumn(), MofNCompleteColumn(), TextColumn("runs{task.description}"),
+                TimeRemainingColumn(),
+            )  # fmt: skip
+            self.bar = Progress(*columns, console=Console(stderr=True), transient=True)
+            self.bar.start()
+            self.task = self.bar.add_task("", total=None)
+        return self.told
+
+    def told(self, done: int, total: int, failed: int) -> None:
+        """One more run is done."""
+        words = f", {failed} failed" if failed else ""
+        if self.bar is not None:
+            self.bar.update(self.task, completed=done, total=total, description=words)
+        elif self.shown and done * 10 // total > (done - 1) * 10 // total:
+            print(f"{self.title}: {done} of {total} runs{words}", file=sys.stderr)
+
+    def __exit__(self, *_: object) -> None:
+        if self.bar is not None:
+            self.bar.stop()
+
+
+def _summary(folder: Path, info: dict[str, Any]) -> None:
+    """How many runs there are, and in which share of them a bound was broken."""
+    from trainctl.cli.console import listing, show
+    from trainctl.studies.results import shares
+
+    told = {key: info[key] for key in ("complete", "refused", "failed") if info[key] or key == "complete"}
+    print(f"{info['runs']} runs: " + ", ".join(f"{count} {word}" for word, count in told.items()))
+    varied = [key for key, values in info["set"].items() if len(values) > 1]
+    rows = shares(folder, varied)
+    table = listing(None, *varied, "runs", "with a broken bound", "share", "95 % interval")
+    for row in rows[:40]:
+        low, high = row["interval_95"]
+        table.add_row(
+            *map(str, row["values"]), str(row["of"]), str(row["runs"]), f"{100 * row['share']:.3g} %",
+            f"{100 * low:.3g} .. {100 * high:.3g} %",
+        )  # fmt: skip
+    if rows:
+        show(table)
+    if len(rows) > 40:
+        print(f"and {len(rows) - 40} more combinations")
+    for key, words in (("with_collisions", "trains collided"), ("with_gridlocks", "trains waited for each other in a circle")):
+        if info[key]:
+            print(f"in {info[key]} of {info['complete']} runs {words}")
+    for reason in info["reasons"]:
+        print(reason)
+    print(f"results: {folder}/  (results.parquet, summary.png)")

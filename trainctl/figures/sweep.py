@@ -1,0 +1,77 @@
+"""The figure of a sweep: how the margins to the bounds, and what the formation does, spread over its runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from trainctl.figures import style
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+#: Metrics shown, as far as the runs have them: column -> label.
+SHOWN = {
+    "bounds.spacing_lower_margin_m": "room above the\nlower spacing [m]",
+    "bounds.spacing_upper_margin_m": "room below the\nupper spacing [m]",
+    "bounds.speed_lower_margin_mps": "room above the\nlower speed [m/s]",
+    "bounds.speed_upper_margin_mps": "room below the\nupper speed [m/s]",
+    "bounds.coupler_lower_margin_m": "room of couplers,\ncompressed [m]",
+    "bounds.coupler_upper_margin_m": "room of couplers,\nstretched [m]",
+    "formation.settling_s": "settling time [s]",
+    "formation.final_error_m": "spacing error\nat the end [m]",
+}
+
+#: Values that differ by less are one value, and no axis is stretched over it.
+ROUNDING = 1e-6
+
+
+def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
+    """Draw the complete runs over the first setting that is a number and varies, or else in order of size; broken bounds in red.
+
+    Runs that gave nothing are counted in the title: what they would have shown may differ from the rest.
+
+    Parameters
+    ----------
+    frame : DataFrame
+        The dataset of the sweep.
+    parameters : sequence of str
+        Its columns that are parameters.
+    path : Path
+        Picture file.
+    """
+    done = frame[frame["status"] == "complete"]
+    missing = frame["status"].value_counts().drop("complete", errors="ignore").sort_index()
+    runs = f"{len(done)} of {len(frame)} runs complete, {', '.join(f'{n} {status}' for status, n in missing.items())}"
+    shown = [key for key in SHOWN if key in done.columns and np.isfinite(done[key].to_numpy(float)).any()]
+    axis = next((k for k in parameters if k != "run.seed" and done[k].dtype.kind in "if" and done[k].nunique() > 1), None)
+    broken = done["violations"].to_numpy(float) > 0
+    with style.styled():
+        figure, axes = style.panels(max(1, len(shown)), "double", 34.0)
+        for panel, key in zip(axes, shown, strict=False):
+            value = done[key].to_numpy(float)
+            if axis is None:
+                order = np.argsort(value, kind="stable")
+                at, value, red = np.arange(1, len(order) + 1), value[order], broken[order]
+            else:
+                at, red = done[axis].to_numpy(float), broken
+                places = np.unique(at)
+                middle = [np.nanmedian(value[at == x]) if np.isfinite(value[at == x]).any() else np.nan for x in places]
+                panel.plot(places, middle, color=style.GREY, label="median")
+            for chosen, colour, label in ((~red, 0, "all bounds held"), (red, 1, "a bound broken")):
+                if chosen.any():
+                    panel.plot(at[chosen], value[chosen], ".", markersize=3, color=style.COLOURS[colour], label=label)
+            least, most = np.nanmin(value), np.nanmax(value)
+            if most - least < ROUNDING:
+                panel.set_ylim(least - 1.0, most + 1.0)
+            if key.startswith("bounds."):
+                panel.axhline(0.0, color="black", linestyle="--", linewidth=0.6)
+            panel.set_ylabel(SHOWN[key])
+        axes[0].set_title(runs if len(missing) else f"all {len(frame)} runs", loc="left")
+        axes[-1].set_xlabel("runs in order of size" if axis is None else axis)
+        figure.align_ylabels(axes)
+        style.legend(figure, "double")
+        style.save(figure, path.with_suffix(""), (path.suffix[1:],))

@@ -1,0 +1,369 @@
+"""Figures of whole trains: positions, spacings, speeds, inputs, the train graph."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from trainctl.figures import style
+from trainctl.runs.known import Facts, facts, leader
+from trainctl.runs.run import Run
+from trainctl.runs.series import INSTANT, Pairs, Series, pairs, series
+from trainctl.signals import Bools, Floats
+
+#: Events that the train graph marks.
+SHOWN_EVENTS = ("topology", "reroute", "join", "leave", "fault", "limit")
+
+#: The same where trains come and go: marks on the train's own line, and their words.
+MARKS = {
+    "couple": ("^", "couples"), "uncouple": ("v", "uncouples"), "stop_reached": ("s", "stops"),
+    "conflict": ("D", "waits for its turn"), "reroute": ("o", "new route"), "reroute_refused": ("x", "route refused"),
+    "supervisor": ("|", "supervisor acts"),
+}  # fmt: skip
+
+
+@dataclass
+class Drawn:
+    """A run made ready for drawing."""
+
+    run: Run
+    known: Facts
+    trains: Series
+    links: Pairs
+    units: Series
+    width: str  # "single" or "double", see style.WIDTHS_MM
+
+    @cached_property
+    def instants(self) -> Floats:
+        """All recorded times [s]."""
+        time: Floats = np.unique(self.trains.column("time_s"))
+        return time
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """All trains, in the order of the scenario."""
+        known = self.known.trains
+        return (*known, *(name for name in self.trains.names if name not in known))
+
+    @cached_property
+    def colour(self) -> dict[str, Any]:
+        """Colour of each train."""
+        return dict(zip(self.names, style.colours(len(self.names)), strict=True))
+
+    @cached_property
+    def look(self) -> dict[str, dict[str, Any]]:
+        """Colour and line width of each train."""
+        widths = style.weights(len(self.names))
+        return {name: {"color": self.colour[name], "linewidth": width} for name, width in zip(self.names, widths, strict=True)}
+
+
+def prepare(run: Run, width: str = "double") -> Drawn:
+    """Sort the tables of a run into series."""
+    return Drawn(run, facts(run), series(run.trains, "train"), pairs(run.links), series(run.units, "train", "unit"), width)
+
+
+def positions(drawn: Drawn) -> Figure:
+    """Positions against time, and below relative to the reference, where trains 5 km apart can be told from each other."""
+    reference = drawn.known.reference
+    figure, axes = style.panels(1 if reference is None else 2, drawn.width)
+    time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
+    inside = in_formation(drawn)
+    for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
+        relative = position[rows] - (0.0 if reference is None else leader(reference, time[rows])[0])
+        for panel, value in zip(axes, (position[rows] / 1000, relative / 1000), strict=False):
+            _in_and_out(panel, time[rows], value, inside[rows], drawn.colour[name], label)
+    if reference is not None:
+        instants = drawn.instants
+        style.draw(axes[0], instants, leader(reference, instants)[0] / 1000, color="black", linestyle=":", label="reference")
+        axes[1].set_ylabel(r"$x_i - x_r$ [km]")
+    axes[0].set_ylabel("position [km]")
+    _finish(figure, axes, drawn)
+    return figure
+
+
+def spacings(drawn: Drawn) -> Figure:
+    """Spacing of every link, one panel per desired spacing and bounds; bounds dashed, desired dotted."""
+    groups: dict[tuple[float, float, float], list[tuple[str, Floats, Floats]]] = {}
+    time, spacing = drawn.links.column("time_s"), drawn.links.column("spacing_m")
+    keys = np.column_stack([drawn.links.column(name) for name in ("desired_m", "lower_m", "upper_m")])
+    for name, rows in drawn.links.slices():
+        kinds, which = np.unique(keys[rows], axis=0, return_inverse=True)
+        for k, kind in enumerate(kinds):
+            here = which.ravel() == k
+            groups.setdefault(tuple(kind.tolist()), []).append((name, time[rows][here], spacing[rows][here]))
+    shown = sorted(sorted(groups, key=lambda key: -len(groups[key]))[:4])
+    figure, axes = style.panels(len(shown), drawn.width, 40.0)
+    looks = _looks(drawn.links.names)
+    for panel, key in zip(axes, shown, strict=True):
+        desired, lower, upper = key
+        style.bound(panel, lower / 1000, upper / 1000)
+        panel.axhline(desired / 1000, color="black", linestyle=":", linewidth=0.9, label="desired", zorder=3)
+        for name, at, value in groups[key]:
+            style.draw(panel, at, value / 1000, **looks[name])
+        panel.set_ylabel("spacing [km]")
+    if len(groups) > len(shown):
+        axes[-1].set_title(f"{len(groups) - len(shown)} other pairs of desired spacing and bounds not shown")
+    _finish(figure, axes, drawn)
+    return figure
+
+
+def spacing_errors(drawn: Drawn) -> Figure:
+    """Distance of every link from its desired spacing, logarithmic."""
+    figure, axes = style.panels(1, drawn.width, 52.0)
+    time, error = drawn.links.column("time_s"), np.abs(drawn.links.column("error_m"))
+    smallest = 1e-6  # m; below it is rounding
+    looks = _looks(drawn.links.names)
+    for name, rows in drawn.links.slices():
+        style.draw(axes[0], time[rows], np.maximum(error[rows], 1e-3 * smallest), **looks[name])
+    axes[0].set_yscale("log")
+    axes[0].set_ylim(bottom=max(smallest, 0.5 * error[error > 0].min(initial=np.inf)) if (error > smallest).any() else smallest)
+    axes[0].set_ylabel(r"$|x_{ij} - d_{ij}|$ [m]")
+    _finish(figure, axes, drawn)
+    return figure
+
+
+def speeds(drawn: Drawn) -> Figure:
+    """Speeds of the trains with bounds and reference."""
+    figure, axes = style.panels(1, drawn.width, 52.0)
+    draw_speeds(axes[0], drawn)
+    _finish(figure, axes, drawn)
+    return figure
+
+
+def draw_speeds(panel: Axes, drawn: Drawn) -> None:
+    """Draw speeds, bounds and reference into a panel."""
+    time, speed = drawn.trains.column("time_s"), drawn.trains.column("speed_mps")
+    style.bound(panel, *_distinct(drawn.known.speed_mps.values()))
+    for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
+        style.draw(panel, time[rows], speed[rows], label=label, **drawn.look[name])
+    if drawn.known.reference is not None:
+        instants = drawn.instants
+        reference = leader(drawn.known.reference, instants)[1]
+        style.draw(panel, instants, reference, color="black", linestyle=":", label="reference", zorder=3)
+    if drawn.known.cruise_mps is not None:
+        style.bound(panel, drawn.known.cruise_mps, label="cruising speed", color="black", linestyle=":")
+    panel.set_ylabel("speed [m/s]")
+
+
+def inputs(drawn: Drawn) -> Figure:
+    """Applied inputs with bounds."""
+    figure, axes = style.panels(1, drawn.width, 52.0)
+    draw_inputs(axes[0], drawn)
+    _finish(figure, axes, drawn)
+    return figure
+
+
+def draw_inputs(panel: Axes, drawn: Drawn) -> None:
+    """Draw applied inputs, held until the next row, and bounds into a panel."""
+    time, applied = drawn.trains.column("time_s"), drawn.trains.column("input_mps2")
+    style.bound(panel, *_distinct(drawn.known.input_mps2.values()))
+    for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
+        style.draw(panel, time[rows], applied[rows], label=label, drawstyle="steps-post", **drawn.look[name])
+    panel.set_ylabel(r"input [m/s$^2$]")
+
+
+def speeds_and_inputs(drawn: Drawn) -> Figure:
+    """Speeds above, applied inputs below."""
+    figure, axes = style.panels(2, drawn.width)
+    draw_speeds(axes[0], drawn)
+    draw_inputs(axes[1], drawn)
+    _finish(figure, axes, drawn)
+    return figure
+
+
+def train_graph(drawn: Drawn) -> Figure:
+    """Time-distance diagram: one colour per train, one line style per track, switches marked, events as vertical lines.
+
+    Where trains come and go, full lines are trains in formations, and marks on the lines say what happened to them.
+    """
+    if drawn.known.traffic:
+        return _coming_and_going(drawn)
+    reference = drawn.known.reference
+    figure, axes = style.panels(1 if reference is None else 2, drawn.width, 60.0)
+    time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
+    track = drawn.trains.frame["track"].astype(str).to_numpy()
+    tracks, switched = sorted(set(track), key=lambda name: (len(name), name)), False
+    for name, rows in drawn.trains.slices():
+        at, on = time[rows], track[rows]
+        cuts = np.flatnonzero(on[1:] != on[:-1]) + 1
+        switched |= len(cuts) > 0
+        absolute = position[rows] / 1000
+        relative = absolute - (0.0 if reference is None else leader(reference, at)[0] / 1000)
+        for panel, value in zip(axes, (absolute, relative), strict=False):
+            for begin, end in zip([0, *cuts], [*cuts, len(at)], strict=True):
+                line = style.TRACK_STYLES[tracks.index(on[begin]) % len(style.TRACK_STYLES)]
+                style.draw(panel, at[begin : end + 1], value[begin : end + 1], color=drawn.colour[name], linestyle=line)
+            panel.plot(at[cuts], value[cuts], linestyle="none", marker="o", markersize=4, color=drawn.colour[name], zorder=4)
+            for k in cuts if panel is axes[-1] else ():
+                panel.annotate(
+                    f"{on[k - 1]}→{on[k]}", (at[k], value[k]), xytext=(6, 0), textcoords="offset points", fontsize=6.5,
+                    va="center", color=drawn.colour[name], zorder=5, bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6},
+                )  # fmt: skip
+    happened = {event["time_s"] for event in drawn.run.events if event["kind"] in SHOWN_EVENTS and event["time_s"] > time.min()}
+    for at_time in happened:
+        for panel in axes:
+            panel.axvline(at_time, color=style.GREY, linewidth=0.5, zorder=1)
+    axes[0].set_ylabel("position [km]")
+    if reference is not None:
+        axes[1].set_ylabel(r"$x_i - x_r$ [km]")
+    axes[-1].set_xlabel("time [s]")
+    axes[-1].set_xlim(drawn.instants[0], drawn.instants[-1])
+    handles = [
+        Line2D([], [], color=drawn.colour[name], label=label)
+        for name, label in zip(drawn.trains.names, style.labels(drawn.trains.names, "train "), strict=True)
+        if not label.startswith("_")
+    ]
+    styles = [
+        Line2D([], [], color=style.GREY, linestyle=style.TRACK_STYLES[k % len(style.TRACK_STYLES)], label=f"track {name}")
+        for k, name in enumerate(tracks)
+    ]
+    marks = []
+    if switched:
+        marks.append(Line2D([], [], color=style.GREY, linestyle="none", marker="o", markersize=4, label="changes track"))
+    if happened:
+        marks.append(Line2D([], [], color=style.GREY, linewidth=0.5, label="event"))
+    style.legend(figure, drawn.width, [*handles, *styles, *marks])
+    return figure
+
+
+def _coming_and_going(drawn: Drawn) -> Figure:
+    """Train graph of a net of any shape: positions run on along every way, so trains of different tracks may cross in it."""
+    figure, axes = style.panels(1, drawn.width, 90.0)
+    time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m") / 1000
+    inside = in_formation(drawn)
+    rows_of = dict(drawn.trains.slices())
+    for (name, rows), label in zip(rows_of.items(), style.labels(drawn.trains.names, "train "), strict=True):
+        _in_and_out(axes[0], time[rows], position[rows], inside[rows], drawn.colour[name], label)
+    marks = []
+    for kind, (mark, words) in MARKS.items():
+        events = [e for e in drawn.run.events if e["kind"] == kind and e.get("train") in rows_of]
+        for event in events:
+            rows = rows_of[event["train"]]
+            at = float(np.interp(event["time_s"], time[rows], position[rows]))
+            axes[0].plot(
+                event["time_s"], at, linestyle="none", marker=mark, markersize=4.5, color=drawn.colour[event["train"]],
+                markeredgecolor="black", markeredgewidth=0.5, zorder=4,
+            )  # fmt: skip
+        if events:
+            marks.append(Line2D(
+                [], [], color=style.GREY, linestyle="none", marker=mark, markersize=4.5, markeredgecolor="black",
+                markeredgewidth=0.5, label=f"{words} ({len(events)})",
+            ))  # fmt: skip
+    axes[0].set_ylabel("position [km]")
+    axes[0].set_xlabel("time [s]")
+    axes[0].set_xlim(drawn.instants[0], drawn.instants[-1])
+    handles = [
+        Line2D([], [], color=drawn.colour[name], label=label)
+        for name, label in zip(drawn.trains.names, style.labels(drawn.trains.names, "train "), strict=True)
+        if not label.startswith("_")
+    ]
+    alone = [] if inside.all() else [Line2D([], [], color=style.GREY, linestyle=":", linewidth=0.7, label="in no formation")]
+    style.legend(figure, drawn.width, [*handles, *alone, *marks])
+    return figure
+
+
+def speed_over_position(drawn: Drawn) -> Figure:
+    """Speed against kilometrage, with the speed of the reference where it was."""
+    figure, axes = style.panels(1, drawn.width, 52.0)
+    position, speed = drawn.trains.column("position_m") / 1000, drawn.trains.column("speed_mps")
+    for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
+        axes[0].plot(*style.envelope(position[rows], speed[rows]), label=label, **drawn.look[name])
+    if drawn.known.reference is not None:
+        where, reference = leader(drawn.known.reference, drawn.instants)
+        axes[0].plot(where / 1000, reference, color="black", linestyle=":", label="reference", zorder=3)
+    axes[0].set_xlabel("position [km]")
+    axes[0].set_ylabel("speed [m/s]")
+    style.legend(figure, drawn.width)
+    return figure
+
+
+def gaps(drawn: Drawn) -> Figure:
+    """Clear distance from the rear of the train ahead, with what the links want and allow at least."""
+    figure, axes = style.panels(1, drawn.width, 52.0)
+    time, gap = drawn.trains.column("time_s"), drawn.trains.column("gap_m") / 1000
+    for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
+        if np.isfinite(gap[rows]).any():
+            style.draw(axes[0], time[rows], gap[rows], label=f"{label} to the one ahead", **drawn.look[name])
+    wanted, least = set(), set()
+    for (ahead, _), (_, rows) in zip(drawn.links.ends, drawn.links.slices(), strict=True):
+        length = sum(drawn.known.length_m.get(ahead, (0.0,)))
+        wanted |= set(np.unique(drawn.links.column("desired_m")[rows] - length).tolist())
+        least |= set(np.unique(drawn.links.column("lower_m")[rows] - length).tolist())
+    emergency = drawn.known.controller.get("emergency_distance_m")
+    if isinstance(emergency, int | float):
+        least.add(float(emergency))
+    if len(wanted) <= 4:
+        for value in wanted:
+            axes[0].axhline(value / 1000, color="black", linestyle=":", linewidth=0.9, label="desired", zorder=3)
+    if len(least) <= 4:
+        style.bound(axes[0], *(value / 1000 for value in least), label="least allowed")
+    axes[0].set_ylabel("gap [km]")
+    _finish(figure, axes, drawn)
+    return figure
+
+
+def comparison(runs: Sequence[Run], names: Sequence[str], width: str = "double") -> Figure:
+    """Speeds of several runs, one panel each on a common scale: a law against ordinary consensus, with and without disturbance."""
+    with style.styled():
+        drawn = [prepare(run, width) for run in runs]
+        figure, axes = style.panels(len(drawn), width, sharey=True)
+        for panel, one, name in zip(axes, drawn, names, strict=True):
+            draw_speeds(panel, one)
+            panel.set_title(name, loc="left")
+        axes[-1].set_xlabel("time [s]")
+        style.legend(figure, width)
+    return figure
+
+
+def _finish(figure: Figure, axes: Sequence[Axes], drawn: Drawn) -> None:
+    axes[-1].set_xlabel("time [s]")
+    axes[-1].set_xlim(drawn.instants[0], drawn.instants[-1])
+    style.legend(figure, drawn.width)
+
+
+def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Colour, width and label of links."""
+    rows = zip(names, style.colours(len(names)), style.weights(len(names)), style.labels(names), strict=True)
+    return {name: {"color": colour, "linewidth": width, "label": label} for name, colour, width, label in rows}
+
+
+def _distinct(ranges: Any) -> list[float]:
+    """The different finite bounds of all trains; none if there are too many to be told apart."""
+    found = sorted({float(value) for pair in ranges for value in pair if np.isfinite(value)})
+    return found if len(found) <= 6 else []
+
+
+def in_formation(drawn: Drawn) -> Bools:
+    """True for rows of trains in a formation: as logged, else where they have a link; for all rows if nobody ever has one."""
+    rows = drawn.trains.frame
+    if "in_formation" in rows:
+        member: Bools = drawn.trains.column("in_formation") > 0.5
+        return member
+    if not drawn.links.names:
+        return np.ones(len(rows), dtype=np.bool_)
+    at = np.round(drawn.links.column("time_s") / INSTANT).astype(np.int64)
+    linked: dict[str, set[int]] = {}
+    for ends, (_, part) in zip(drawn.links.ends, drawn.links.slices(), strict=True):
+        for name in ends:
+            linked.setdefault(name, set()).update(at[part].tolist())
+    out = np.zeros(len(rows), dtype=np.bool_)
+    instants = np.round(drawn.trains.column("time_s") / INSTANT).astype(np.int64)
+    for name, part in drawn.trains.slices():
+        out[part] = np.isin(instants[part], list(linked.get(name, ())))
+    return out
+
+
+def _in_and_out(panel: Axes, time: Floats, value: Floats, inside: Bools, colour: Any, label: str) -> None:
+    """Full line where the train is in the formation, thin dotted where it is not."""
+    style.draw(panel, time, np.where(inside, value, np.nan), color=colour, label=label)
+    if not inside.all():
+        outside = ~inside
+        outside[1:] |= outside[:-1] & inside[1:]  # reach to the first row inside
+        style.draw(panel, time, np.where(outside, value, np.nan), color=colour, linestyle=":", linewidth=0.7, alpha=0.8)

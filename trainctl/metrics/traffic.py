@@ -1,0 +1,204 @@
+"""Metrics of the traffic: headways, throughput, what SUMO's own logs say; also from any FCD log, ours or not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from trainctl.errors import InputError
+from trainctl.metrics.values import Values, put_worst
+from trainctl.runs.series import INSTANT, Series
+from trainctl.runs.sumo_logs import elements, fcd_batches, find_log
+from trainctl.signals import Floats
+
+#: Headways in time are counted for trains faster than this [m/s]: one that stands has none.
+MOVING_MPS = 1.0
+
+#: attribute of a tripinfo -> name of its mean
+TRIPINFO = {
+    "duration": "traffic.sumo_duration_mean_s",
+    "routeLength": "traffic.sumo_route_length_mean_m",
+    "waitingTime": "traffic.sumo_waiting_time_mean_s",
+    "timeLoss": "traffic.sumo_time_loss_mean_s",
+    "departDelay": "traffic.sumo_depart_delay_mean_s",
+}
+
+DEFINITIONS: dict[str, tuple[str, str]] = {
+    "traffic.gap_min_m": ("m", "Least distance from the rear of the train ahead to the front of a train."),
+    "traffic.spacing_min_m": ("m", "Least distance from front to front of a train and the one ahead."),
+    "traffic.spacing_mean_m": ("m", "Mean of that distance over all rows."),
+    "traffic.headway_min_s": ("s", "Least spacing over the follower's speed, for trains faster than 1 m/s."),
+    "traffic.headway_mean_s": ("s", "Mean of that headway over all rows."),
+    "traffic.speed_mean_mps": ("m/s", "Mean speed over all rows."),
+    "traffic.speed_max_mps": ("m/s", "Greatest speed."),
+    "traffic.section_m": ("m", "Kilometrage at which passages are counted."),
+    "traffic.passages": ("1", "Trains whose front passed the section."),
+    "traffic.trains_per_hour": ("1/h", "Passages less one over the time from the first to the last of them; per track as items."),
+    "traffic.passage_headway_min_s": ("s", "Least time between two fronts at the section on one track."),
+    "traffic.sumo_trips": ("1", "Trips that SUMO saw arrive (tripinfo)."),
+    TRIPINFO["duration"]: ("s", "Mean journey time of these trips."),
+    TRIPINFO["routeLength"]: ("m", "Mean route length."),
+    TRIPINFO["waitingTime"]: ("s", "Mean waiting time (speed below 0.1 m/s)."),
+    TRIPINFO["timeLoss"]: ("s", "Mean delay against driving at the allowed speed."),
+    TRIPINFO["departDelay"]: ("s", "Mean delay of the departure."),
+    "traffic.collisions": ("1", "Collisions that SUMO counted."),
+    "traffic.teleports": ("1", "Vehicles that SUMO teleported."),
+    "traffic.emergency_stops": ("1", "Emergency stops that SUMO counted."),
+    "traffic.emergency_braking": ("1", "Emergency brakings that SUMO counted."),
+    "fcd.duration_s": ("s", "FCD log: time from the first step to the last."),
+    "fcd.steps": ("1", "FCD log: steps with at least one vehicle."),
+    "fcd.vehicles": ("1", "FCD log: different vehicles."),
+    "fcd.rows": ("1", "FCD log: rows."),
+    "fcd.vehicles_mean": ("1", "FCD log: mean number of vehicles per such step."),
+    "fcd.speed_mean_mps": ("m/s", "FCD log: mean speed over all rows."),
+    "fcd.speed_max_mps": ("m/s", "FCD log: greatest speed."),
+    "fcd.standing_share": ("1", "FCD log: share of rows below 0.1 m/s."),
+    "fcd.spacing_min_m": ("m", "FCD log: least distance from front to front on one lane (needs pos and lane)."),
+    "fcd.spacing_mean_m": ("m", "FCD log: mean of that distance."),
+    "fcd.headway_min_s": ("s", "FCD log: least spacing over the follower's speed, for vehicles faster than 1 m/s."),
+    "fcd.headway_mean_s": ("s", "FCD log: mean of that headway."),
+}
+
+
+def of_trains(trains: Series, section_m: float | None) -> Values:
+    """Headways and throughput from our own log."""
+    if not trains.names:
+        return {}
+    values: Values = {}
+    speed, spacing = trains.column("speed_mps"), trains.column("spacing_m")
+    put_worst(values, "traffic.gap_min_m", trains, trains.column("gap_m"), np.minimum)
+    put_worst(values, "traffic.spacing_min_m", trains, spacing, np.minimum)
+    headway = np.where(speed > MOVING_MPS, spacing / np.maximum(speed, MOVING_MPS), np.nan)
+    put_worst(values, "traffic.headway_min_s", trains, headway, np.minimum)
+    for name, number in (("spacing_mean_m", spacing), ("headway_mean_s", headway), ("speed_mean_mps", speed)):
+        if np.isfinite(number).any():
+            values[f"traffic.{name}"] = float(np.mean(number[np.isfinite(number)]))
+    values["traffic.speed_max_mps"] = float(np.max(speed))
+    return values | of_section(trains, section_m)
+
+
+def of_section(trains: Series, section_m: float | None) -> Values:
+    """Passages of fronts at one kilometrage."""
+    position, time = trains.column("position_m"), trains.column("time_s")
+    if section_m is None:
+        lowest = max(float(position[rows].min()) for _, rows in trains.slices())
+        highest = min(float(position[rows].max()) for _, rows in trains.slices())
+        section_m = 0.5 * (lowest + highest)
+    before = trains.follows()[1:] & (position[:-1] < section_m) & (position[1:] >= section_m)
+    k = np.flatnonzero(before)
+    values: Values = {"traffic.section_m": section_m, "traffic.passages": len(k)}
+    if len(k):
+        part = (section_m - position[k]) / (position[k + 1] - position[k])
+        passages = pd.DataFrame({"time_s": time[k] + part * (time[k + 1] - time[k]), "track": trains.frame["track"].to_numpy()[k]})
+        _rate(values, "traffic.trains_per_hour", passages["time_s"].to_numpy())
+        shortest = []
+        for track, times in passages.groupby("track", observed=True)["time_s"]:
+            _rate(values, f"traffic.trains_per_hour/{track}", times.to_numpy())
+            shortest += list(np.diff(np.sort(times.to_numpy())))
+        if shortest:
+            values["traffic.passage_headway_min_s"] = float(min(shortest))
+    return values
+
+
+def _rate(values: Values, name: str, times: Floats) -> None:
+    if len(times) > 1 and np.ptp(times) > 0:
+        values[name] = float((len(times) - 1) * 3600 / np.ptp(times))
+
+
+def of_sumo(folder: Path) -> Values:
+    """Means of tripinfo, collisions and teleports from SUMO's own logs, as far as they are there."""
+    values: Values = {}
+    trips = find_log(folder, "tripinfo")
+    if trips:
+        sums, count = dict.fromkeys(TRIPINFO, 0.0), 0
+        for _, attributes in elements(trips, "tripinfos", {"tripinfo"}):
+            count += 1
+            for attribute in sums:
+                sums[attribute] += _number(trips, attributes, attribute)
+        values["traffic.sumo_trips"] = count
+        values |= {TRIPINFO[attribute]: total / count for attribute, total in sums.items() if count}
+    statistics = find_log(folder, "statistic")
+    if statistics:
+        for tag, attributes in elements(statistics, "statistics", {"teleports", "safety"}):
+            if tag == "teleports":
+                values["traffic.teleports"] = int(_number(statistics, attributes, "total"))
+            else:
+                values["traffic.collisions"] = int(_number(statistics, attributes, "collisions"))
+                values["traffic.emergency_stops"] = int(_number(statistics, attributes, "emergencyStops"))
+                values["traffic.emergency_braking"] = int(_number(statistics, attributes, "emergencyBraking"))
+    return values
+
+
+def _number(path: Path, attributes: dict[str, str], name: str) -> float:
+    try:
+        return float(attributes.get(name, "0"))
+    except ValueError:
+        raise InputError(f"{path}: {name} = {attributes[name]:.40}: not a number") from None
+
+
+def metrics_of_fcd(path: Path | str) -> Values:
+    """Traffic metrics of any FCD log of SUMO: XML, CSV (both also gzipped) or Parquet; streaming, whatever its size.
+
+    Parameters
+    ----------
+    path : Path
+        The log. Its kind is told from its content, not from its name.
+
+    Raises
+    ------
+    InputError
+        Not an FCD log, damaged, or with document types or entities in it.
+    """
+    return _of_rows(fcd_batches(Path(path)), Path(path))
+
+
+def _of_rows(batches: Iterable[pd.DataFrame], path: Path) -> Values:
+    vehicles: set[str] = set()
+    steps = rows = standing = 0
+    begin, end = np.inf, -np.inf
+    speed_sum, speed_max = 0.0, -np.inf
+    spacing, headway = _Mean(), _Mean()
+    for batch in batches:
+        time, speed = batch["time_s"].to_numpy(), batch["speed"].to_numpy()
+        if np.any(np.diff(time) < 0) or time[0] <= end:
+            raise InputError(f"{path}: time does not ascend near {time[0]:g} s")
+        begin, end = min(begin, float(time[0])), float(time[-1])
+        vehicles.update(batch["id"].unique())
+        steps += 1 + int(np.count_nonzero(np.diff(time) > INSTANT))
+        rows, standing = rows + len(time), standing + int(np.count_nonzero(speed < 0.1))
+        speed_sum, speed_max = speed_sum + float(speed.sum()), max(speed_max, float(speed.max()))
+        if {"lane", "pos"} <= set(batch.columns):
+            order = np.lexsort((batch["pos"].to_numpy(), batch["lane"].astype("category").cat.codes.to_numpy(), time))
+            one = batch.iloc[order]
+            same = (one["time_s"].to_numpy()[1:] == one["time_s"].to_numpy()[:-1]) & (
+                one["lane"].to_numpy()[1:] == one["lane"].to_numpy()[:-1]
+            )
+            distance, follower = np.diff(one["pos"].to_numpy())[same], one["speed"].to_numpy()[:-1][same]
+            spacing.add(distance)
+            headway.add(distance[follower > MOVING_MPS] / follower[follower > MOVING_MPS])
+    if not rows:
+        raise InputError(f"{path}: no vehicle in this FCD log")
+    values: Values = {
+        "fcd.duration_s": end - begin, "fcd.steps": steps, "fcd.vehicles": len(vehicles), "fcd.rows": rows,
+        "fcd.vehicles_mean": rows / steps, "fcd.speed_mean_mps": speed_sum / rows, "fcd.speed_max_mps": speed_max,
+        "fcd.standing_share": standing / rows,
+    }  # fmt: skip
+    for name, unit, mean in (("spacing", "m", spacing), ("headway", "s", headway)):
+        if mean.count:
+            values |= {f"fcd.{name}_min_{unit}": mean.least, f"fcd.{name}_mean_{unit}": mean.total / mean.count}
+    return values
+
+
+class _Mean:
+    """Mean and least value of numbers that come in pieces."""
+
+    def __init__(self) -> None:
+        self.count, self.total, self.least = 0, 0.0, np.inf
+
+    def add(self, numbers: Floats) -> None:
+        if len(numbers):
+            self.count, self.total = self.count + len(numbers), self.total + float(numbers.sum())
+            self.least = min(self.least, float(numbers.min()))

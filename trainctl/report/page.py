@@ -1,0 +1,213 @@
+"""One page per run, ``report.html``: verdicts, an animation of the tracks and linked plots. It opens offline."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from trainctl.errors import InputError
+from trainctl.figures.trains import Drawn, prepare
+from trainctl.metrics.run import DEFINITIONS, SLACK, metrics
+from trainctl.record.folder import plain
+from trainctl.report.animation import animation
+from trainctl.report.panels import panels
+from trainctl.runs.outcome import summary
+from trainctl.runs.run import Run
+
+#: Bounds in words, by the name of their margin.
+BOUNDS = {
+    "spacing_lower_margin_m": ("spacing above its lower bound", "m"),
+    "spacing_upper_margin_m": ("spacing below its upper bound", "m"),
+    "speed_lower_margin_mps": ("speed above its lower bound", "m/s"),
+    "speed_upper_margin_mps": ("speed below its upper bound", "m/s"),
+    "input_lower_margin_mps2": ("input above its lower bound", "m/s²"),
+    "input_upper_margin_mps2": ("input below its upper bound", "m/s²"),
+    "coupler_lower_margin_m": ("coupler stroke above its lower bound", "m"),
+    "coupler_upper_margin_m": ("coupler stroke below its upper bound", "m"),
+}
+
+#: What else the summary names.
+FIGURES = (
+    "formation.settling_s", "formation.final_error_m", "formation.final_speed_error_mps", "traffic.gap_min_m",
+    "traffic.headway_min_s",
+    "traffic.trains_per_hour", "energy.traction_kwh", "energy.net_kwh_per_train_km", "comfort.jerk_max_mps3", "string.l2_gain",
+    "traffic.collisions", "traffic.teleports",
+)  # fmt: skip
+
+
+#: In place of the animation.
+NO_FILM = (
+    '<p class="keys">There is no animation: a run without SUMO does not know where the tracks of its net lie. The plots below show'
+    " every train.</p>"
+)
+
+
+def report(run: Run, out: Path | str | None = None) -> Path:
+    """Write the page of a run.
+
+    Parameters
+    ----------
+    run : Run
+        A run folder.
+    out : Path, optional
+        The file; default ``report.html`` in the run folder.
+
+    Returns
+    -------
+    Path
+        The file.
+    """
+    path = Path(out) if out is not None else run.folder / "report.html"
+    text = page(run)
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+    return path
+
+
+def page(run: Run) -> str:
+    """The whole page as text."""
+    from plotly.offline import get_plotlyjs
+
+    drawn = prepare(run)
+    if not drawn.trains.names:
+        raise InputError(f"{run.folder}: no train was recorded")
+    values = run.metrics if (run.folder / "metrics.json").exists() else metrics(run)
+    film = animation(drawn)
+    span = [float(drawn.instants[0]), float(drawn.instants[-1])]
+    data: dict[str, Any] = {"animation": film, "panels": panels(drawn), "title": drawn.known.title, "span": span}
+    parts = {
+        "title": escape(drawn.known.title or run.folder.name),
+        "css": _template("report.css"),
+        "library": get_plotlyjs(),
+        "script": _template("report.js"),
+        "data": _inline(data),
+        "about": _about(drawn),
+        "verdict": _outcome(drawn.run) + _verdict(values, drawn.run),
+        "bounds": _bounds(values),
+        "figures": _figures(values),
+        "events": _events(film),
+        "tracks": "On the net" if drawn.known.traffic else "On the tracks",
+        "no_film": "" if film["time"] else NO_FILM,
+        "hidden": "" if film["time"] else "hidden",
+    }
+    return _filled(_template("report.html"), parts)
+
+
+def _template(name: str) -> str:
+    return (files("trainctl.report") / "templates" / name).read_text(encoding="utf-8")
+
+
+def _filled(template: str, parts: Mapping[str, str]) -> str:
+    """The template with each ``{{name}}`` replaced; what is put in is not looked at again."""
+    out = []
+    for piece in template.split("{{"):
+        name, closed, rest = piece.partition("}}")
+        out.append(parts[name] + rest if closed else piece)
+    return "".join(out)
+
+
+def _inline(data: Any) -> str:
+    """JSON that may stand inside a script element whatever names it contains."""
+    return (
+        json.dumps(plain(data), separators=(",", ":"))
+        .replace("<", "\\u003c")
+        .replace("\u2028", "\\u2028")
+        .replace("\u2029", "\\u2029")
+    )
+
+
+def _about(drawn: Drawn) -> str:
+    info, known = drawn.run.info, drawn.known
+    versions = info.get("versions", {})
+    words = [
+        f"law {known.law}" if known.law else "",
+        f"{len(drawn.trains.names)} trains",
+        f"{drawn.instants[-1] - drawn.instants[0]:g} s",
+        f"backend {info['backend']}" if info.get("backend") else "",
+        f"status {info.get('status', 'unknown')}",
+        f"trainctl {versions['trainctl']}" if versions.get("trainctl") else "",
+        f"SUMO {versions['sumo']}" if versions.get("sumo") and info.get("backend") == "sumo" else "",
+        f"seed {info['seed']}" if "seed" in info else "",
+    ]
+    return escape(" · ".join(word for word in words if word))
+
+
+def _margins(values: Mapping[str, Any]) -> list[tuple[str, str, float, str]]:
+    """Of every kind of bound: words, unit, least margin, whose it is."""
+    found = []
+    for name, (words, unit) in BOUNDS.items():
+        key = f"bounds.{name}"
+        if isinstance(values.get(key), int | float):
+            whose = {k.partition("/")[2]: v for k, v in values.items() if k.startswith(f"{key}/") and isinstance(v, int | float)}
+            found.append((words, unit, float(values[key]), min(whose, key=lambda k: whose[k]) if whose else ""))
+    return found
+
+
+def _outcome(run: Run) -> str:
+    """What failed the run, and what is to be known besides: as on the terminal."""
+    lines = summary(run)[:-1] if "violations" in run.info else []
+    return "".join(
+        f'<p class="verdict{" broken" if line.failed else ""}"><strong>{escape(line.title.capitalize())}</strong>:'
+        f" {escape(line.text)}</p>"
+        for line in lines
+    )
+
+
+def _verdict(values: Mapping[str, Any], run: Run) -> str:
+    """All bounds held, or which broke first, where and when."""
+    margins = _margins(values)
+    broken = [words for words, _, margin, _ in margins if margin < -SLACK]
+    if not margins:
+        return '<p class="verdict"><strong>No bounds</strong> are stated in this scenario.</p>'
+    if not broken and run.info.get("checks_failed"):
+        return f'<p class="verdict">None of {len(margins)} kinds of bound was broken at a recorded instant.</p>'
+    if not broken:
+        return f'<p class="verdict held"><strong>All bounds held</strong> ({len(margins)} kinds, at every recorded instant).</p>'
+    first = ""
+    if isinstance(values.get("bounds.first_violation_s"), int | float):
+        who = escape(str(values.get("bounds.first_violation_who", "")))
+        first = f" First at {values['bounds.first_violation_s']:g} s: {who}."
+    return f'<p class="verdict broken"><strong>{len(broken)} of {len(margins)} kinds of bound broken.</strong>{first}</p>'
+
+
+def _bounds(values: Mapping[str, Any]) -> str:
+    rows = []
+    for words, unit, margin, whose in _margins(values):
+        held = margin >= -SLACK
+        shown = "0" if abs(margin) <= SLACK else f"{margin:.6g}"
+        rows.append(
+            f"<tr><th scope=row>{words}</th><td class=n>{shown}</td><td>{unit}</td><td>{escape(whose)}</td>"
+            f'<td class="{"held" if held else "broken"}">{"held" if held else "broken"}</td></tr>'
+        )
+    return "".join(rows)
+
+
+def _figures(values: Mapping[str, Any]) -> str:
+    rows = []
+    for name in FIGURES:
+        if name in values:
+            value, (unit, words) = values[name], DEFINITIONS.get(name, ("", ""))
+            shown = "never" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+            rows.append(
+                f'<tr><th scope=row title="{escape(words)}">{escape(name)}</th>'
+                f"<td class=n>{escape(shown)}</td><td>{escape(unit)}</td></tr>"
+            )
+    return "".join(rows)
+
+
+def _events(found: Mapping[str, Any]) -> str:
+    """Rows of the table of events; each time is a button that moves the slider there."""
+    rows = [
+        f'<tr><td class=n><button type=button class=link data-time="{event["time"]:g}">{event["time"]:g}</button></td>'
+        f"<td>{escape(str(event['kind']))}</td><td>{escape(event['text'])}</td></tr>"
+        for event in found["events"]
+    ]
+    if found["events_left_out"]:
+        rows.append(f"<tr><td></td><td></td><td>and {found['events_left_out']} more in events.jsonl</td></tr>")
+    return "".join(rows)

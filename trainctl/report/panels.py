@@ -1,0 +1,316 @@
+"""The interactive panels of a report, as plain data: every line downsampled so that its extremes stay.
+
+A panel is a table that the page turns into one plot; all share their time axis. Numbers travel as 32-bit floats in base64, which
+the plotting library reads as they are: 7 digits, 1.6 cm at 200 km.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from trainctl.figures import style
+from trainctl.figures.trains import Drawn, in_formation
+from trainctl.metrics.driving import JOULES_PER_KWH
+from trainctl.metrics.values import at_least, at_most
+from trainctl.runs.known import leader
+from trainctl.runs.series import INSTANT
+from trainctl.signals import Bools, Floats
+
+Panel = dict[str, Any]
+Trace = dict[str, Any]
+
+#: Points of one panel at most, shared by its lines: a browser draws that many without a stutter.
+POINTS_PER_PANEL = 40_000
+#: Points of one line: at most, and at least however many lines there are.
+POINTS = (2000, 120)
+#: Dashes of the library per track, in lateral order, as ``style.TRACK_STYLES``.
+DASHES = ("solid", "8px,3px", "2px,3px", "8px,3px,2px,3px")
+#: More different bounds than this in one panel are not drawn.
+BOUNDS = 6
+
+
+def packed(values: Floats) -> dict[str, str]:
+    """Numbers as the plotting library reads them: little-endian 32-bit floats in base64."""
+    return {"dtype": "f4", "bdata": base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()}
+
+
+def panels(drawn: Drawn) -> list[Panel]:
+    """All panels that apply to a run, in the order of the page."""
+    found = [*_train_graph(drawn), _speeds(drawn), *_spacings(drawn), *_errors(drawn), _inputs(drawn)]
+    found += [*_unit_forces(drawn), *_couplers(drawn), *_energy(drawn), *_events(drawn)]
+    return [panel for panel in found if panel["traces"]]
+
+
+def panel(name: str, title: str, unit: str, traces: list[Trace], **more: Any) -> Panel:
+    """One panel; ``bounds`` are horizontal lines (value, name, dash)."""
+    return {"id": name, "title": title, "unit": unit, "traces": traces, **more}
+
+
+def _line(x: Floats, y: Floats, name: str, colour: str, lines: int, **look: Any) -> Trace:
+    most, least = POINTS
+    x, y = style.envelope(
+        *style.broken(np.asarray(x, float), np.asarray(y, float)), int(np.clip(POINTS_PER_PANEL // lines, least, most))
+    )
+    return {"x": packed(x), "y": packed(y), "name": name, "color": colour, **look}
+
+
+def _colour(drawn: Drawn, name: str) -> str:
+    return _hex(drawn.colour[name])
+
+
+def _hex(colour: Any) -> str:
+    if isinstance(colour, str):
+        return colour
+    return "#" + "".join(f"{round(255 * float(part)):02x}" for part in colour[:3])
+
+
+def _limits(values: Any) -> list[dict[str, Any]]:
+    found = sorted({float(v) for v in values if np.isfinite(v)})
+    return [{"value": v, "name": "bound", "dash": "dash"} for v in found] if len(found) <= BOUNDS else []
+
+
+def _reference(drawn: Drawn, value: Floats) -> Trace:
+    return _line(drawn.instants, value, "reference", "ink", 10, dash="dot")
+
+
+def _train_graph(drawn: Drawn) -> Iterator[Panel]:
+    """Time against distance, one dash per track; below, relative to the reference."""
+    time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
+    if drawn.known.traffic:
+        yield panel("graph", "Train graph", "position [km]", list(_in_and_out(drawn, position / 1000)), note=IN_AND_OUT)
+        return
+    track = drawn.trains.frame["track"]
+    lateral = [str(name) for name in track.astype("category").cat.categories]
+    on = track.astype(str).to_numpy()
+    reference = drawn.known.reference
+    kinds = [("graph", "Train graph", "position [km]")]
+    if reference is not None:
+        kinds.append(("relative", "Position relative to the reference", "x - x_r [km]"))
+    for name, title, unit in kinds:
+        traces: list[Trace] = []
+        for train, rows in drawn.trains.slices():
+            value = position[rows] / 1000
+            if name == "relative" and reference is not None:
+                value = value - leader(reference, time[rows])[0] / 1000
+            for k, place in enumerate(lateral):
+                here = on[rows] == place
+                if not here.any():
+                    continue
+                reach: Bools = here.copy()
+                reach[1:] |= here[:-1]  # up to the first row on the next track: the line has no hole
+                traces.append(_line(
+                    time[rows], np.where(reach, value, np.nan), f"train {train}, track {place}", _colour(drawn, train),
+                    len(drawn.trains.names), dash=DASHES[k % len(DASHES)], group=train,
+                ))  # fmt: skip
+        if reference is not None and name == "graph":
+            traces.append(_reference(drawn, leader(reference, drawn.instants)[0] / 1000))
+        yield panel(name, title, unit, traces, note="One colour per train, one dash per track." if name == "graph" else "")
+
+
+#: Of panels of trains that come and go.
+IN_AND_OUT = "Full where the train is in a formation, dotted where it is not; no line where it is not there."
+
+
+def _in_and_out(drawn: Drawn, value: Floats) -> Iterator[Trace]:
+    """A full line for the train in formations, a dotted one for the train alone."""
+    time, inside = drawn.trains.column("time_s"), in_formation(drawn)
+    for name, rows in drawn.trains.slices():
+        inner = inside[rows]
+        outer: Bools = ~inner
+        outer[1:] |= outer[:-1] & inner[1:]  # up to the first row in the formation: the line has no hole
+        for here, dash, words in ((inner, "solid", ""), (outer, "2px,3px", ", in no formation")):
+            if here.any():
+                yield _line(
+                    time[rows], np.where(here, value[rows], np.nan), f"train {name}{words}", _colour(drawn, name),
+                    len(drawn.trains.names), dash=dash, group=name,
+                )  # fmt: skip
+
+
+def _speeds(drawn: Drawn) -> Panel:
+    speed = drawn.trains.column("speed_mps")
+    traces = list(_in_and_out(drawn, speed)) if drawn.known.traffic else _of_trains(drawn, speed)
+    if drawn.known.reference is not None:
+        traces.append(_reference(drawn, leader(drawn.known.reference, drawn.instants)[1]))
+    bounds = _limits(value for pair in drawn.known.speed_mps.values() for value in pair)
+    if drawn.known.cruise_mps is not None:
+        bounds.append({"value": drawn.known.cruise_mps, "name": "cruising speed", "dash": "dot"})
+    note = f"{IN_AND_OUT} Bounds are those of trains in formations." if drawn.known.traffic else ""
+    return panel("speeds", "Speeds against bounds", "speed [m/s]", traces, bounds=bounds, note=note)
+
+
+def _inputs(drawn: Drawn) -> Panel:
+    traces = _of_trains(drawn, drawn.trains.column("input_mps2"), step=True)
+    bounds = _limits(value for pair in drawn.known.input_mps2.values() for value in pair)
+    note = "Applied force of the whole train per mass, held until the next row."
+    return panel("inputs", "Inputs against limits", "input [m/s²]", traces, bounds=bounds, note=note)
+
+
+def _of_trains(drawn: Drawn, value: Floats, **look: Any) -> list[Trace]:
+    time, count = drawn.trains.column("time_s"), len(drawn.trains.names)
+    return [
+        _line(time[rows], value[rows], f"train {name}", _colour(drawn, name), count, group=name, **look)
+        for name, rows in drawn.trains.slices() if np.isfinite(value[rows]).any()
+    ]  # fmt: skip
+
+
+def _spacings(drawn: Drawn) -> Iterator[Panel]:
+    """Spacing of every link, one panel per desired spacing and bounds."""
+    links = drawn.links
+    if not links.names:
+        return
+    time, spacing = links.column("time_s"), links.column("spacing_m")
+    keys = np.column_stack([links.column(name) for name in ("desired_m", "lower_m", "upper_m")])
+    groups: dict[tuple[float, float, float], list[tuple[int, str, Any]]] = {}
+    for k, (name, rows) in enumerate(links.slices()):
+        kinds, which = np.unique(keys[rows], axis=0, return_inverse=True)
+        for j, kind in enumerate(kinds):
+            groups.setdefault(tuple(kind.tolist()), []).append((k, name, np.flatnonzero(which.ravel() == j) + rows.start))
+    colours = style.colours(len(links.names))
+    shown = sorted(sorted(groups, key=lambda key: -len(groups[key]))[:4])
+    for number, key in enumerate(shown):
+        desired, lower, upper = key
+        traces = [
+            _line(time[rows], spacing[rows] / 1000, f"link {name}", _hex(colours[k]), len(groups[key]), group=name)
+            for k, name, rows in groups[key]
+        ]
+        bounds = _limits([lower / 1000, upper / 1000]) + [{"value": desired / 1000, "name": "desired", "dash": "dot"}]
+        title = f"Spacing against bounds, desired {desired / 1000:g} km"
+        note = (
+            f"{len(groups) - len(shown)} other pairs of desired spacing and bounds are not shown."
+            if len(groups) > len(shown)
+            else ""
+        )
+        yield panel(f"spacing{number or ''}", title, "spacing [km]", traces, bounds=bounds, note=note if number == 0 else "")
+
+
+def _errors(drawn: Drawn) -> Iterator[Panel]:
+    links = drawn.links
+    if not links.names:
+        return
+    time, error = links.column("time_s"), np.maximum(np.abs(links.column("error_m")), 1e-9)
+    colours = style.colours(len(links.names))
+    traces = [
+        _line(time[rows], error[rows], f"link {name}", _hex(colours[k]), len(links.names), group=name)
+        for k, (name, rows) in enumerate(links.slices())
+    ]
+    least = max(1e-6, float(error.min()))
+    high = max(10.0 * least, float(error.max()))
+    yield panel(
+        "errors",
+        "Distance from the desired spacing",
+        "|error| [m]",
+        traces,
+        log=[float(np.log10(least)), float(np.log10(2 * high))],
+    )
+
+
+def _unit_forces(drawn: Drawn) -> Iterator[Panel]:
+    if not drawn.units.names:
+        return
+    low, high = at_most(drawn.units, "force_min_n", "force_n"), at_least(drawn.units, "force_max_n", "force_n")
+    limits = {limit for row in drawn.known.traction_n.values() for limit in row}
+    limits |= {-limit for row in drawn.known.braking_n.values() for limit in row}
+    traces = _of_units(drawn, drawn.units.column("force_n") / 1000, low / 1000, high / 1000, "unit")
+    bounds = _limits(limit / 1000 for limit in limits)
+    note = "Shaded: least and greatest of all units of a train over the sub-steps since the last row."
+    yield panel("forces", "Unit forces against limits", "unit force [kN]", traces, bounds=bounds, note=note)
+
+
+def _couplers(drawn: Drawn) -> Iterator[Panel]:
+    if not drawn.units.names or not np.isfinite(drawn.units.column("coupler_m")).any():
+        return
+    low, high = at_most(drawn.units, "coupler_min_m", "coupler_m"), at_least(drawn.units, "coupler_max_m", "coupler_m")
+    traces = _of_units(drawn, drawn.units.column("coupler_m"), low, high, "coupler")
+    yield panel(
+        "couplers", "Coupler strokes against their range", "coupler stroke [m]", traces, bounds=_limits(drawn.known.coupler_m),
+        note="Positive when stretched. Shaded as above.", least_range=1e-3,
+    )  # fmt: skip
+
+
+def _of_units(drawn: Drawn, value: Floats, low: Floats, high: Floats, what: str) -> list[Trace]:
+    """A line per unit, and per train the band of the extremes of its units."""
+    time, lines = drawn.units.column("time_s"), len(drawn.units.names) + 2 * len(drawn.names)
+    traces, bands = [], []
+    of_train: dict[str, list[slice]] = {}
+    for name, rows in drawn.units.slices():
+        if np.isfinite(value[rows]).any():
+            train, _, unit = name.rpartition(".")
+            of_train.setdefault(train, []).append(rows)
+            alpha = max(1.0 - 0.15 * (int(unit) - 1), 0.4) if unit.isdigit() else 1.0
+            traces.append(_line(time[rows], value[rows], f"{what} {name}", _colour(drawn, train), lines, group=train, alpha=alpha))
+    for train, parts in of_train.items():
+        at = np.unique(np.round(np.concatenate([time[rows] for rows in parts]) / INSTANT)) * INSTANT
+        least, greatest = np.full(len(at), np.inf), np.full(len(at), -np.inf)
+        for rows in parts:
+            k = np.clip(np.searchsorted(at, time[rows] - INSTANT / 2), 0, len(at) - 1)
+            least[k], greatest[k] = np.fmin(least[k], low[rows]), np.fmax(greatest[k], high[rows])
+        some = np.isfinite(least) & np.isfinite(greatest)
+        at, least, greatest = at[some], least[some], greatest[some]
+        if not len(at):
+            continue
+        stretch = -(-len(at) // 500)
+        starts = np.arange(0, len(at), stretch)
+        least, greatest = np.minimum.reduceat(least, starts), np.maximum.reduceat(greatest, starts)
+        band = {"color": _colour(drawn, train), "group": train, "band": True, "x": packed(at[starts])}
+        bands += [{**band, "y": packed(least), "name": f"least, train {train}"}]
+        bands += [{**band, "y": packed(greatest), "name": f"greatest, train {train}", "fill": True}]
+    return bands + traces
+
+
+def _energy(drawn: Drawn) -> Iterator[Panel]:
+    """Work at the wheel since the start, per train."""
+    frame, split = drawn.trains.frame, drawn.trains
+    time, count = split.column("time_s"), 2 * len(split.names)
+    unit, note = "work [kWh]", "Traction full, braking dotted; at the wheel, integrated over the sub-steps."
+    if {"traction_j", "braking_j"} <= set(frame.columns):
+        traction, braking = np.nan_to_num(split.column("traction_j")), np.nan_to_num(split.column("braking_j"))
+    else:
+        mass = {name: sum(row) for name, row in drawn.known.mass_kg.items()}
+        known = set(split.names) <= set(mass)
+        weight = np.repeat([mass[name] if known else 1000.0 for name in split.names], np.diff(split.first))
+        moved = np.append(0.0, np.diff(split.column("position_m"))) * split.follows()
+        work = np.append(0.0, np.nan_to_num(split.column("input_mps2") * weight)[:-1]) * moved
+        traction, braking = np.maximum(work, 0.0), np.maximum(-work, 0.0)
+        unit = unit if known else "work [kWh/t]"
+        note = "Traction full, braking dotted; at the wheel, input held between rows."
+    traces = []
+    for name, rows in split.slices():
+        for work, dash, what in ((traction, "solid", "traction"), (braking, "dot", "braking")):
+            total = np.cumsum(work[rows]) / JOULES_PER_KWH
+            traces.append(_line(time[rows], total, f"train {name}, {what}", _colour(drawn, name), count, dash=dash, group=name))
+    yield panel("energy", "Energy", unit, traces, note=note)
+
+
+def _events(drawn: Drawn) -> Iterator[Panel]:
+    """What happened when: one row per kind."""
+    by_kind: dict[str, list[tuple[float, str]]] = {}
+    for event in drawn.run.events:
+        by_kind.setdefault(event["kind"], []).append((float(event["time_s"]), told(event)))
+    most = 500
+    traces = []
+    for k, (kind, items) in enumerate(sorted(by_kind.items())):
+        some = items if len(items) <= most else items[:: -(-len(items) // most)]
+        traces.append({
+            "x": [at for at, _ in some], "y": [kind] * len(some), "text": [text for _, text in some],
+            "name": f"{kind} ({len(items)})",
+            "color": _hex(style.COLOURS[k % len(style.COLOURS)]), "points": True,
+        })  # fmt: skip
+    yield panel("events", "Events", "", traces, categories=True, note="Hover for details.")
+
+
+def told(event: dict[str, Any]) -> str:
+    """An event in one line, without its time and kind."""
+    parts = []
+    for key, value in event.items():
+        if key in ("time_s", "kind") or value in ([], None):
+            continue
+        if key == "edges":
+            value = " ".join("-".join(map(str, edge)) for edge in value)
+        elif key == "formations":
+            value = " | ".join(" ".join(map(str, group)) for group in value)
+        parts.append(f"{key} {value:.6g}" if isinstance(value, float) else f"{key} {value}")
+    return ", ".join(parts)[:300]

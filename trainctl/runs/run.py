@@ -1,0 +1,178 @@
+"""Reading a run folder, finished or not: tables as DataFrames, loaded when first asked for.
+
+``run = Run("runs/three_tracks")`` has ``run.trains``, ``run.units``, ``run.links`` (DataFrames with the columns of the run
+folder), ``run.events``, ``run.info``, ``run.metrics`` and ``run.scenario``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from trainctl.errors import InputError
+from trainctl.record.folder import FORMAT, INFO, SCHEMA_VERSION
+from trainctl.runs.schema import check_table
+
+
+class Run:
+    """A run folder of ours; a run that was killed is read as far as it was closed.
+
+    Parameters
+    ----------
+    folder : Path
+        ``DIR``, or ``DIR.partial`` of a run that did not complete.
+
+    Raises
+    ------
+    InputError
+        Not a run folder, or of a later schema; on access: a file is missing or damaged.
+    """
+
+    def __init__(self, folder: Path | str) -> None:
+        self.folder = Path(folder)
+        if not self.folder.is_dir():
+            raise InputError(f"{folder}: no such directory")
+        if not (self.folder / INFO).is_file():
+            raise InputError(f"{folder}: not a run folder: it has no {INFO}")
+        info = _json(self.folder / INFO)
+        if not isinstance(info, dict) or info.get("format") != FORMAT:
+            raise InputError(f"{self.folder / INFO}: not a run of trainctl")
+        if info.get("schema_version") != SCHEMA_VERSION:
+            raise InputError(
+                f"{self.folder / INFO}: schema_version = {info.get('schema_version')}: this trainctl reads {SCHEMA_VERSION}"
+            )
+        self.info: dict[str, Any] = info
+
+    def __repr__(self) -> str:
+        """Folder, status and size in one line."""
+        return f"Run({str(self.folder)!r}, {self.info.get('status')}, {self.info.get('steps', '?')} steps)"
+
+    @property
+    def ok(self) -> bool:
+        """Whether the run is complete and nothing failed it: no collision, no gridlock, with the supervisor on no overspeed."""
+        return self.info.get("status") == "complete" and not self.info.get("checks_failed")
+
+    @property
+    def collisions(self) -> int:
+        """Pairs of trains that collided."""
+        return int(self.info.get("collisions", 0))
+
+    @cached_property
+    def trains(self) -> pd.DataFrame:
+        """One row per step and train."""
+        return self.table("trains")
+
+    @cached_property
+    def units(self) -> pd.DataFrame:
+        """One row per recorded instant and unit; empty if the plant has no units."""
+        return self.table("units", missing_is_empty=True)
+
+    @cached_property
+    def links(self) -> pd.DataFrame:
+        """One row per step and link."""
+        return self.table("links")
+
+    @cached_property
+    def events(self) -> list[dict[str, Any]]:
+        """The lines of events.jsonl. A last line cut short by a kill is left out."""
+        path = self.folder / "events.jsonl"
+        lines = _bytes(path).split(b"\n")
+        events = []
+        for number, line in enumerate(lines[:-1], start=1):
+            try:
+                event = json.loads(line)
+                if not math.isfinite(event["time_s"]) or not isinstance(event["kind"], str):
+                    raise TypeError
+            except (ValueError, KeyError, TypeError, RecursionError):
+                raise InputError(f"{path}: line {number} is not an event") from None
+            events.append(event)
+        return events
+
+    @cached_property
+    def metrics(self) -> dict[str, Any]:
+        """Content of metrics.json."""
+        content = _json(self.folder / "metrics.json")
+        if not isinstance(content, dict):
+            raise InputError(f"{self.folder / 'metrics.json'}: not a table of metrics")
+        return content
+
+    @cached_property
+    def scenario(self) -> dict[str, Any]:
+        """The scenario as resolved, as plain tables."""
+        path = self.folder / "scenario.toml"
+        try:
+            return tomllib.loads(_bytes(path).decode())
+        except (ValueError, RecursionError) as error:  # not TOML, not text, a number of 5000 digits
+            raise InputError(f"{path}: {error}") from None
+
+    def files(self, table: str) -> list[Path]:
+        """The Parquet files of a table: one, or the closed segments of a run that was killed."""
+        whole = self.folder / f"{table}.parquet"
+        return [whole] if whole.exists() else sorted((self.folder / "segments").glob(f"{table}-*.parquet"))
+
+    def batches(self, table: str, columns: list[str] | None = None, rows: int = 1 << 18) -> Iterator[pd.DataFrame]:
+        """A table in pieces of at most ``rows`` rows: for logs larger than memory."""
+        for path in self.files(table):
+            with _parquet(path) as file:
+                try:
+                    for batch in file.iter_batches(batch_size=rows, columns=columns):
+                        yield batch.to_pandas()
+                except (pa.ArrowException, OSError) as error:
+                    raise InputError(f"{path}: damaged: {_first_line(error)}") from None
+
+    def table(self, table: str, missing_is_empty: bool = False) -> pd.DataFrame:
+        """A whole table; names are categorical columns."""
+        files = self.files(table)
+        if not files:
+            if missing_is_empty:
+                return pd.DataFrame()
+            raise InputError(f"{self.folder}: {table}.parquet is missing")
+        parts = []
+        for path in files:
+            with _parquet(path) as file:
+                try:
+                    parts.append(file.read())
+                except (pa.ArrowException, OSError) as error:
+                    raise InputError(f"{path}: damaged: {_first_line(error)}") from None
+        try:
+            joined = pa.concat_tables(parts).unify_dictionaries()
+        except pa.ArrowException as error:
+            raise InputError(f"{self.folder}: segments of {table} do not fit together: {_first_line(error)}") from None
+        check_table(table, joined, self.folder)
+        whole: pd.DataFrame = joined.to_pandas()
+        return whole
+
+
+def _parquet(path: Path) -> pq.ParquetFile:
+    """An open Parquet file, or one clear line."""
+    try:
+        return pq.ParquetFile(path)
+    except (pa.ArrowException, OSError) as error:
+        raise InputError(f"{path}: not a complete Parquet file: {_first_line(error)}") from None
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from None
+
+
+def _json(path: Path) -> Any:
+    try:
+        return json.loads(_bytes(path))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not JSON: {error}") from None
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).partition("\n")[0]

@@ -1,0 +1,205 @@
+"""The trains of a SUMO configuration as the loop needs them: ways, departures and stops, on a map of the whole net."""
+
+from __future__ import annotations
+
+import fnmatch
+import math
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sumo_net import Line, LineError, Rails
+from sumo_net.layout import Gradient
+from trainctl.errors import InputError
+from trainctl.scenario.tables import Scenario, Train, TrainType
+from trainctl.scenario.tables import Traffic as Driving
+from trainctl.signals import Bools, Floats, Ints
+from trainctl.traffic.kinds import train_type
+from trainctl.traffic.read import Departure, Traffic, read_traffic
+
+
+class Stop(NamedTuple):
+    """A place on a train's way where it stands."""
+
+    place: float  # m, position of the front
+    duration: float  # s
+    until: float  # s, it does not leave before; -inf if it may
+    name: str
+
+
+class Roster(NamedTuple):
+    """Trains that come and go, n of them."""
+
+    depart: Floats  # (n,) s
+    edge: Ints  # (n,) first edge of the way
+    lane_position: Floats  # (n,) m, front, at departure
+    speed: Floats  # (n,) m/s at departure, NaN: as fast as is safe
+    top_speed: Floats  # (n,) m/s
+    speed_factor: Floats  # (n,) share of a speed limit that a train keeps to, at most 1: nobody is driven above a limit
+    routes: tuple[tuple[str, ...], ...]  # edge ids, internal ones included
+    stops: tuple[tuple[Stop, ...], ...]
+    cooperates: Bools  # (n,)
+    vclass: tuple[str, ...]
+    notes: tuple[str, ...]  # what of the configuration is not followed
+    rails: Rails
+
+
+def tables(roster: Roster) -> dict[str, Any]:
+    """A roster in what JSON knows, but for its net."""
+    found = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in roster._asdict().items()}
+    del found["rails"]
+    return found
+
+
+def from_tables(data: Mapping[str, Any], net: Path) -> Roster:
+    """Read a roster back from its ``tables`` and its net."""
+    numbers = {name: np.array(data[name], float) for name in ("depart", "lane_position", "speed", "top_speed", "speed_factor")}
+    return Roster(
+        **numbers,
+        edge=np.array(data["edge"], np.int64),
+        routes=tuple(tuple(route) for route in data["routes"]),
+        stops=tuple(tuple(Stop(*stop) for stop in stops) for stops in data["stops"]),
+        cooperates=np.array(data["cooperates"], bool),
+        vclass=tuple(data["vclass"]),
+        notes=tuple(data["notes"]),
+        rails=Rails.read(net),
+    )
+
+
+def chart(rails: Rails) -> Line:
+    """A whole net in the shape of a line: every normal edge is a track of its own, and takes the internal ones that lead to it."""
+    tracks = [rails.edges[_leads_to(rails, e)] for e in range(len(rails.edges))]
+    names = tuple(e for e, inside in zip(rails.edges, rails.internal, strict=True) if not inside)
+    return Line(
+        edges=rails.edges, tracks=tuple(tracks), start_m=rails.start_m, length_m=rails.length_m, speed_mps=rails.speed_mps,
+        crossovers=(), gradient=Gradient(np.zeros(1), np.zeros(1)), track_ids=names, begin_m=float(rails.start_m.min()),
+        end_m=float((rails.start_m + rails.length_m).max()),
+    )  # fmt: skip
+
+
+def _leads_to(rails: Rails, edge: int) -> int:
+    while rails.internal[edge] and rails.after[edge]:
+        edge = rails.after[edge][0]
+    return edge
+
+
+def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
+    """Read the traffic of a scenario with ``network.sumocfg``.
+
+    Returns
+    -------
+    tuple
+        The scenario with its trains and their types, the roster, and the file of the net.
+
+    Raises
+    ------
+    InputError
+        Everything that is wrong with the configuration, its net, its trains and their data.
+    """
+    with tempfile.TemporaryDirectory(prefix="traffic.") as work:
+        traffic = read_traffic(folder / str(scenario.network.sumocfg), Path(work), scenario.run.duration_s)
+    try:
+        rails = Rails.read(traffic.net)
+    except LineError as error:
+        raise InputError([f"network.sumocfg: {m}" for m in error.mistakes]) from None
+    types, found = _types(scenario, traffic)
+    driving = scenario.traffic or Driving()
+    ids = [d.id for d in traffic.departures]
+    together = np.array([any(fnmatch.fnmatchcase(i, p) for p in driving.cooperate) for i in ids], bool)
+    found += [
+        f"traffic.cooperate = {p}: no train of that name; there are: {', '.join(ids[:8])}{' ...' if len(ids) > 8 else ''}"
+        for p in driving.cooperate
+        if not any(fnmatch.fnmatchcase(i, p) for i in ids)
+    ]
+    found += _events(scenario, ids, rails)
+    trains, routes, stops = [], [], []
+    factor = np.array([min(traffic.kinds[d.kind].speed_factor, 1.0) for d in traffic.departures])
+    for d, share in zip(traffic.departures, factor.tolist(), strict=True):
+        try:
+            way = rails.way(d.edges)
+            begin = rails.start_m[way[0]] + np.concatenate([[0.0], np.cumsum(rails.length_m[way[:-1]])])
+            stops.append(_stops(d, rails, way, begin, traffic.begin_s))
+        except ValueError as error:
+            found.append(f"network.sumocfg: train {d.id}: {error}")
+            continue
+        routes.append(tuple(rails.edges[e] for e in way.tolist()))
+        trains.append(
+            Train(
+                id=d.id, type=d.kind, track=d.edges[0], position_m=float(begin[0] + d.position_m),
+                speed_mps=min(float(d.speed_mps if d.speed_mps is not None else scenario.reference.speed_mps or 0.0),
+                              traffic.kinds[d.kind].max_speed_mps, share * float(rails.speed_mps[way[0]])),
+            )
+        )  # fmt: skip
+    if found:
+        raise InputError(list(dict.fromkeys(found)))
+    departures = traffic.departures
+    roster = Roster(
+        depart=np.array([max(d.depart_s - traffic.begin_s, 0.0) for d in departures]),
+        edge=np.array([rails.index[d.edges[0]] for d in departures], np.int64),
+        lane_position=np.array([d.position_m for d in departures]),
+        speed=np.array([math.nan if d.speed_mps is None else d.speed_mps for d in departures]),
+        top_speed=np.array([traffic.kinds[d.kind].max_speed_mps for d in departures]),
+        speed_factor=factor,
+        routes=tuple(routes),
+        stops=tuple(stops),
+        cooperates=together,
+        vclass=tuple(traffic.kinds[d.kind].vclass for d in departures),
+        notes=traffic.notes,
+        rails=rails,
+    )
+    return scenario.model_copy(update={"train": tuple(trains), "train_type": types}), roster, traffic.net
+
+
+def in_formation(scenario: Scenario, slots: Floats) -> Scenario:
+    """All trains on one track, every one at its slot and at the reference's speed."""
+    speed = float(scenario.reference.speed_mps or 0.0)
+    trains = tuple(
+        t.model_copy(update={"track": "", "position_m": float(slot), "speed_mps": speed})
+        for t, slot in zip(scenario.train, slots, strict=True)
+    )
+    return scenario.model_copy(update={"train": trains})
+
+
+def _events(scenario: Scenario, ids: list[str], rails: Rails) -> list[str]:
+    """Orders to trains or edges that are not there."""
+    found = []
+    edges = [edge for edge, inside in zip(rails.edges, rails.internal, strict=True) if not inside]
+    for k, event in enumerate(scenario.event, 1):
+        for key, name, known, what in (("train", event.train, ids, "train"), ("to_edge", event.to_edge, edges, "edge for trains")):
+            if name is not None and name not in known:
+                some = f"{', '.join(known[:8])}{' ...' if len(known) > 8 else ''}"
+                found.append(f"event[{k}].{key} = {name}: no such {what}; there are: {some}")
+    return found
+
+
+def _types(scenario: Scenario, traffic: Traffic) -> tuple[dict[str, TrainType], list[str]]:
+    """Data of every vType that runs: the scenario's own, else what the vType says of itself."""
+    types, found = dict(scenario.train_type), []
+    for name in dict.fromkeys(d.kind for d in traffic.departures):
+        if name not in types:
+            kind = train_type(traffic.kinds[name])
+            if isinstance(kind, list):
+                found += kind
+            else:
+                types[name] = kind
+        elif scenario.plant.kind == "point" and types[name].units > 1:
+            found.append(f"train_type.{name}.units = {types[name].units}: the point plant has one unit per train")
+    return types, found
+
+
+def _stops(departure: Departure, rails: Rails, way: Ints, begin: Floats, begin_s: float) -> tuple[Stop, ...]:
+    """Stops in the order of the way; an edge that is passed more than once has those behind the last place on its next passage."""
+    found, row, last = [], 0, departure.position_m
+    for stop in departure.stops:
+        edge = rails.index[stop.edge]
+        row += int(way[row] == edge and stop.position_m < last)
+        ahead = np.flatnonzero(way[row:] == edge)
+        if not len(ahead):
+            raise ValueError(f"stop on edge {stop.edge} at {stop.position_m:g} m: lies behind the departure or the stop before")
+        row, last = row + int(ahead[0]), stop.position_m
+        until = -math.inf if stop.until_s is None else stop.until_s - begin_s
+        found.append(Stop(float(begin[row] + stop.position_m), stop.duration_s, until, stop.name or stop.edge))
+    return tuple(found)

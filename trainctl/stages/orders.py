@@ -1,0 +1,195 @@
+"""Reroutes: orders that wait for their time, place or condition, and the way found over the rails.
+
+A switch is locked for a train that could not stop before it any more, so an order that comes later takes the next one. What cannot
+be done is refused, with the reason, as an event; the train goes on as it was. Only where nobody supervises the trains, an order of
+the scenario that leads nowhere (its switch lies behind the train) is a mistake of its file and ends the run.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sumo_net.line import LineCrossover
+from trainctl.errors import InputError
+from trainctl.railway import supervisor
+from trainctl.railway.ways import Ways
+from trainctl.scenario.build import Prepared
+from trainctl.scenario.tables import Event
+from trainctl.signals import Floats, Ints
+from trainctl.stages.record import Journal
+from trainctl.world import Seen
+
+
+class Refused(Exception):
+    """An order that cannot be followed, in words."""
+
+
+class LeadsNowhere(Refused):
+    """There is no such way from where the train is, braking distance or not."""
+
+
+class Reroutes:
+    """Orders still to come.
+
+    Attributes
+    ----------
+    pending : list of (int, Event)
+        Number and order, by time.
+    """
+
+    def __init__(self, p: Prepared) -> None:
+        self.p = p
+        self.pending = sorted(enumerate(p.scenario.event, 1), key=lambda e: e[1].time_s)
+        self.length = p.consists.train_length()
+        self.theta = p.step_theta
+
+    def add(self, event: Event) -> None:
+        """One more order."""
+        if event.train not in self.p.scenario.ids:
+            raise ValueError(f"train {event.train}: no such train; there are: {', '.join(self.p.scenario.ids)}")
+        self.pending.append((len(self.p.scenario.event) + 1, event))
+
+    def orders(
+        self, t: float, seen: Seen, ways: Ways, speed: Floats, ahead: Ints, journal: Journal
+    ) -> list[tuple[int, tuple[str, ...]]]:
+        """Orders whose time, place or condition has come: trains and their new routes.
+
+        Parameters
+        ----------
+        t : float
+            Now [s].
+        seen : Seen
+            Where every train is.
+        ways : Ways
+            Their ways now.
+        speed, ahead : ndarray, shape (n,)
+            Speed [m/s], and the train ahead in the formation, -1 if none.
+        journal : Journal
+            Takes the events ``reroute`` and ``reroute_refused``.
+
+        Returns
+        -------
+        list of (int, tuple of str)
+            Train and edges from the one it is on, internal ones included.
+        """
+        found: list[tuple[int, tuple[str, ...]]] = []
+        for number, event in list(self.pending):
+            i = self.p.scenario.ids.index(event.train)
+            if not self._is_due(t, event, i, seen, speed, ahead):
+                continue
+            self.pending.remove((number, event))
+            lock = float(supervisor.stopping_distance(
+                np.maximum(speed[i : i + 1], 0.0), self.p.supervision.service_mps2, self.p.scenario.run.step_s, self.theta
+            )[0])  # fmt: skip
+            try:
+                if any(i == other for other, _ in found):
+                    raise Refused("it has just been given another route")
+                if event.to_edge is None:
+                    edges, more = self._over_a_crossover(event, i, seen, speed, lock)
+                else:
+                    edges, more = self._to_an_edge(event, i, seen, ways, lock)
+            except Refused as why:
+                if isinstance(why, LeadsNowhere) and self.p.scenario.supervisor is None and number <= len(self.p.scenario.event):
+                    where = f"train {event.train} is at {seen.position[i]:.3f} m on track {self.p.line.tracks[seen.edge[i]]}"
+                    raise InputError(f"{self.p.file}: event[{number}]: {why}; {where} at {t:g} s") from None
+                journal.event(
+                    t, "reroute_refused", train=event.train, order=number, reason=str(why), position_m=float(seen.position[i]),
+                    speed_mps=float(speed[i]),
+                )  # fmt: skip
+                continue
+            journal.event(t, "reroute", train=event.train, **more)
+            found.append((i, edges))
+        return found
+
+    def _is_due(self, t: float, event: Event, i: int, seen: Seen, speed: Floats, ahead: Ints) -> bool:
+        if event.time_s > t + 1e-9 or not seen.present[i]:
+            return False
+        if event.position_m is not None and seen.position[i] < event.position_m:
+            return False
+        if event.speed_below_mps is not None and not speed[i] < event.speed_below_mps:
+            return False
+        if event.gap_below_m is None:
+            return True
+        j = int(ahead[i])
+        return j >= 0 and bool(seen.position[j] - self.length[j] - seen.position[i] < event.gap_below_m)
+
+    def _over_a_crossover(
+        self, event: Event, i: int, seen: Seen, speeds: Floats, lock: float
+    ) -> tuple[tuple[str, ...], dict[str, Any]]:
+        line = self.p.line
+        edge, position = int(seen.edge[i]), float(seen.position[i])
+        track = line.tracks[edge]
+        if track == event.to_track:
+            raise Refused(f"the train is on track {track} already")
+        try:
+            if event.crossover is not None:
+                over = line.crossover[event.crossover]
+            else:
+                found = line.next_crossover(track, min(position + lock, line.end_m), str(event.to_track))
+                if found is None:
+                    if line.next_crossover(track, position, str(event.to_track)) is None:
+                        raise LeadsNowhere(f"no crossover to track {event.to_track} ahead")
+                    raise Refused(
+                        f"no crossover from track {track} to track {event.to_track} beyond {position + lock:.1f} m, where the train"
+                        " could still stop before it"
+                    )
+                over = found
+            if over.from_track == track and position < over.start_m < position + lock:
+                raise Refused(
+                    f"switch {over.id} at {over.start_m:.1f} m is locked: {over.start_m - position:.1f} m ahead, braking takes"
+                    f" {lock:.1f} m"
+                )
+            edges = line.route_over(line.edges[edge], over.id)
+        except ValueError as error:
+            raise LeadsNowhere(str(error)) from None
+        if self.p.supervision.mode != "on":
+            self._unprotected(i, over, seen, speeds)
+        more = {"crossover": over.id, "from_track": over.from_track, "to_track": over.to_track, "switch_m": over.start_m}
+        return edges, more
+
+    def _unprotected(self, i: int, over: LineCrossover, seen: Seen, speed: Floats) -> None:
+        """What nobody would save the train from while there is no supervisor."""
+        cure = '[supervisor] mode = "on" does'
+        if over.speed_mps < speed[i]:
+            raise Refused(
+                f"crossover {over.id} allows {over.speed_mps:g} m/s, the train runs at {speed[i]:g} m/s, and nobody would brake it:"
+                f" {cure}"
+            )
+        join = over.start_m + over.length_m
+        after = (join - float(seen.position[i])) / max(float(speed[i]), 0.1)
+        then = seen.position + speed * after
+        there = np.array([self.p.line.tracks[e] == over.to_track for e in seen.edge.tolist()]) & seen.present
+        meets = np.flatnonzero(there & (then - self.length < join) & (then > join - self.length[i]))
+        if len(meets):
+            j = int(meets[0])
+            raise Refused(
+                f"train {self.p.scenario.ids[j]} would be at the join of crossover {over.id} at {join:.1f} m at the same time, and"
+                f" nobody would keep them apart: {cure}"
+            )
+
+    def _to_an_edge(self, event: Event, i: int, seen: Seen, ways: Ways, lock: float) -> tuple[tuple[str, ...], dict[str, Any]]:
+        rails = self.p.rails
+        target = rails.index.get(str(event.to_edge), -1)
+        if target < 0:
+            raise Refused(f"edge {event.to_edge}: not on this net, or not for trains")
+        row, end = int(seen.row[i]), int(ways.first[i + 1])
+        way, begin = ways.edge[row:end], ways.begin[row:end]
+        kept = int(np.searchsorted(begin, seen.position[i] + lock, side="right"))  # what begins beyond may still change
+        for k in range(min(kept, len(way)), 0, -1):
+            path = rails.path(int(way[k - 1]), target)
+            if path is not None:
+                break
+        else:
+            raise Refused(f"edge {event.to_edge} cannot be reached from edge {rails.edges[int(way[0])]}")
+        if k < min(kept, len(way)):
+            raise Refused(
+                f"edge {event.to_edge} can only be reached from edge {rails.edges[int(way[k - 1])]}, which the train cannot leave"
+                f" otherwise any more: braking takes {lock:.1f} m"
+            )
+        onward = rails.path(target, int(way[-1]))
+        new = [*way[: k - 1].tolist(), *path.tolist(), *([] if onward is None else onward[1:].tolist())]
+        common = next((n for n, (a, b) in enumerate(zip(new, way.tolist(), strict=False)) if a != b), min(len(new), len(way)))
+        more = {"to_edge": event.to_edge, "from_edge": rails.edges[int(way[max(common - 1, 0)])], "goes_on": onward is not None}
+        return tuple(rails.edges[e] for e in new), more

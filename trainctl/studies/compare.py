@@ -1,0 +1,233 @@
+"""Several runs side by side: one table, and figures with one panel per run on common axes.
+
+``alternatives`` puts the other laws in front of the same traffic: trains, network, events, reference, bounds and links stay, the
+law and what belongs to it (plant, observer, periods) changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from trainctl.errors import InputError
+from trainctl.figures import style
+from trainctl.figures.trains import Drawn, draw_inputs, draw_speeds, prepare
+from trainctl.metrics.run import DEFINITIONS, metrics
+from trainctl.metrics.values import Values
+from trainctl.runs.known import leader
+from trainctl.runs.run import Run
+
+#: Rows of the table, as far as they apply to any of the runs.
+ROWS = (
+    "bounds.broken", "bounds.spacing_lower_margin_m", "bounds.spacing_upper_margin_m", "bounds.speed_lower_margin_mps",
+    "bounds.speed_upper_margin_mps", "bounds.input_lower_margin_mps2", "bounds.input_upper_margin_mps2",
+    "bounds.coupler_lower_margin_m", "bounds.coupler_upper_margin_m", "bounds.first_violation_s", "formation.settling_s",
+    "formation.final_error_m", "formation.overshoot_m", "formation.final_speed_error_mps", "formation.speed_overshoot_mps",
+    "string.l2_gain", "units.force_min_n", "units.force_max_n", "units.coupler_stroke_m", "units.saturated_share",
+    "energy.traction_kwh", "energy.net_kwh_per_train_km", "comfort.acceleration_max_mps2", "comfort.jerk_max_mps3",
+    "comfort.jerk_rms_mps3", "traffic.gap_min_m", "traffic.headway_min_s", "traffic.trains_per_hour",
+)  # fmt: skip
+
+#: Panels per row of a figure.
+COLUMNS = 3
+
+
+def table(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """One row per metric: ``metric, unit, values`` (one per run, None where it does not apply)."""
+    columns = [_values(run) for run in runs]
+    return [
+        {"metric": name, "unit": DEFINITIONS.get(name, ("", ""))[0], "values": [column.get(name) for column in columns]}
+        for name in ROWS if any(name in column for column in columns)
+    ]  # fmt: skip
+
+
+def _values(run: Run) -> Values:
+    return run.metrics if (run.folder / "metrics.json").exists() else metrics(run)
+
+
+def names(runs: Sequence[Run]) -> list[str]:
+    """A name per run: its folder's, with as much of the path as tells them apart."""
+    for depth in range(1, 5):
+        found = ["/".join(run.folder.resolve().parts[-depth:]) for run in runs]
+        if len(set(found)) == len(found):
+            return found
+    return [f"{k + 1}: {run.folder.name}" for k, run in enumerate(runs)]
+
+
+def figures(runs: Sequence[Run], labels: Sequence[str], out: Path, formats: Sequence[str] = ("png",)) -> list[Path]:
+    """Write ``compare_<what>`` for speeds, inputs, spacing errors and positions relative to the reference."""
+    out.mkdir(parents=True, exist_ok=True)
+    written = []
+    with style.styled():
+        drawn = [prepare(run) for run in runs]
+        if not any(one.trains.names for one in drawn):
+            raise InputError("compare: no train was recorded in any of the runs")
+        for name, paint in PANELS.items():
+            figure = side_by_side(drawn, labels, paint)
+            if name == "spacing_errors":
+                for axes in figure.axes:
+                    axes.set_yscale("log")
+                    axes.set_ylim(bottom=1e-3)
+            written += style.save(figure, out / f"compare_{name}", formats)
+    return written
+
+
+def side_by_side(drawn: Sequence[Drawn], labels: Sequence[str], paint: Callable[[Axes, Drawn], None]) -> Figure:
+    """One panel per run with common axes, at most three in a row."""
+    across = min(COLUMNS, len(drawn))
+    down = -(-len(drawn) // across)
+    millimetre = 1 / 25.4
+    figure = Figure(figsize=(style.WIDTHS_MM["double"] * millimetre, (down * 48.0 + 14.0) * millimetre), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
+    for k, (axes, one, label) in enumerate(zip(grid.flat, drawn, labels, strict=False)):
+        paint(axes, one)
+        axes.set_title(label.replace("_", " "), loc="left")
+        if k % across:
+            axes.set_ylabel("")
+        if k + across >= len(drawn):  # the lowest of its column
+            axes.set_xlabel("time [s]")
+            axes.tick_params(labelbottom=True)
+    for axes in list(grid.flat)[len(drawn) :]:
+        axes.remove()
+    style.legend(figure, "double")
+    return figure
+
+
+def _relative(axes: Axes, drawn: Drawn) -> None:
+    time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
+    reference = drawn.known.reference
+    for name, rows in drawn.trains.slices():
+        at = 0.0 if reference is None else leader(reference, time[rows])[0]
+        style.draw(axes, time[rows], (position[rows] - at) / 1000, label=f"train {name}", **drawn.look[name])
+    axes.set_ylabel("position [km]" if reference is None else r"$x_i - x_r$ [km]")
+
+
+def _errors(axes: Axes, drawn: Drawn) -> None:
+    links = drawn.links
+    for (name, rows), colour in zip(links.slices(), style.colours(len(links.names)), strict=True):
+        style.draw(
+            axes, links.column("time_s")[rows], np.abs(links.column("error_m")[rows]).clip(1e-4), color=colour, label=f"link {name}"
+        )
+    if not links.names:
+        axes.text(0.5, 0.5, "no links", transform=axes.transAxes, ha="center", color=style.GREY)
+    axes.set_ylabel(r"$|x_{ij} - d_{ij}|$ [m]")
+
+
+PANELS: dict[str, Callable[[Axes, Drawn], None]] = {
+    "positions": _relative, "spacing_errors": _errors, "speeds": draw_speeds, "inputs": draw_inputs,
+}  # fmt: skip
+
+
+# --- the other laws on the same traffic -------------------------------------------------------------------------------------------
+
+#: Bounds that the point plant can clamp at.
+CLAMPS = ("speed_lower_mps", "speed_upper_mps", "input_lower_mps2", "input_upper_mps2")
+#: Rows of a comparison, in order -> their law: ordinary consensus and SUMO's two kinds of block are keys of one.
+LAWS = {
+    "fully_distributed": "fully_distributed", "robust_constrained": "robust_constrained", "emu_finite_time": "emu_finite_time",
+    "ordinary_consensus": "emu_finite_time", "fault_tolerant": "fault_tolerant", "sumo_fixed_block": "sumo",
+    "sumo_moving_block": "sumo",
+}  # fmt: skip
+
+
+def alternatives(data: Mapping[str, Any], known: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """The scenario under every law that there is.
+
+    Parameters
+    ----------
+    data : mapping
+        Tables of the scenario as they stand.
+    known : sequence of str
+        Names of the laws there are.
+
+    Returns
+    -------
+    dict
+        Name of the row -> tables of its scenario. Keys of the laws' own that have a counterpart in the scenario's bounds are
+        derived from it; all others are the law's defaults (the paper's).
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for name, law in LAWS.items():
+        if law in known:
+            found[name] = dict(data) if name == _row(data["controller"]) else _under(name, law, data)
+    return found
+
+
+def _row(controller: Mapping[str, Any]) -> str:
+    """The row a scenario is as it stands."""
+    law = str(controller["law"])
+    if law == "emu_finite_time" and float(controller.get("alpha_1", 0.9)) == 1.0:
+        return "ordinary_consensus"
+    return f"sumo_{controller.get('block', 'fixed')}_block" if law == "sumo" else law
+
+
+def _under(name: str, law: str, data: Mapping[str, Any]) -> dict[str, Any]:
+    changed: dict[str, Any] = {key: value for key, value in data.items() if key not in ("controller", "observer")}
+    changed["title"] = f"{name.replace('_', ' ')} on the traffic of: {data.get('title', '')}"
+    run = {"step_s": 1.0, **{key: value for key, value in data["run"].items() if key != "control_period_s"}}
+    topology = dict(data.get("topology", {}))
+    plant = data.get("plant", {"kind": "point"})
+    point = plant.get("kind", "point") == "point"
+    controller: dict[str, Any] = {"law": law}
+    if law == "fully_distributed":
+        controller["eta"] = "own_speed"
+        run["control_period_s"] = run["step_s"] * max(1.0, round(8.0 / run["step_s"]))
+    elif law == "robust_constrained":
+        controller["h_per_s"] = 0.3
+        topology["weight"] = 0.01
+        run["control_period_s"] = run["step_s"] * max(1.0, round(1.0 / run["step_s"]))
+        if point:  # its model clamps speed and input
+            changed["plant"] = {**plant, **{key: value for key, value in data.get("bounds", {}).items() if key in CLAMPS}}
+    elif law == "emu_finite_time":
+        controller |= _clear_distances(data) | {"alpha_1": 1.0 if name == "ordinary_consensus" else 0.9}
+        run["sub_step_s"] = 0.0025 if name == "ordinary_consensus" else 0.01
+    elif law == "sumo":
+        controller["block"] = "fixed" if name == "sumo_fixed_block" else "moving"
+    elif law == "fault_tolerant":
+        error = max((abs(value) for value in _errors_allowed(data)), default=2351.0)
+        far = 2.0 * error  # of a train that follows the reference from another train's slot
+        controller |= {"leader_error_lower_m": -far, "leader_error_upper_m": far, "head_l1_per_s": min(0.01, 0.5 * 50.0 / far)}
+        changed["plant"] = {"kind": "actuated_units"}
+        changed["observer"] = {"kind": "asymptotic"}
+        changed["train_type"] = {key: {"actuator_rate_per_s": 50.0, **kind} for key, kind in data.get("train_type", {}).items()}
+        run["sub_step_s"] = 0.01
+    if not point and law != "fault_tolerant":
+        changed["plant"] = plant if plant["kind"] == "coupled_units" else {"kind": "coupled_units"}
+    return {**changed, "run": run, "topology": topology, "controller": controller}
+
+
+def _clear_distances(data: Mapping[str, Any]) -> dict[str, float]:
+    """Emergency distance and range of the finite-time law from the bounds of the links, less the longest train."""
+    lengths = [_length(kind) for kind in data.get("train_type", {}).values()]
+    longest = max(lengths, default=0.0)
+    places = [data.get("topology", {}), *data.get("link", ())]
+    lower = [float(place["lower_m"]) for place in places if np.isfinite(place.get("lower_m", np.inf))]
+    upper = [float(place["upper_m"]) for place in places if np.isfinite(place.get("upper_m", np.inf))]
+    least = max(1.0, min(lower, default=1500.0 + longest) - longest)
+    desired = float(data.get("topology", {}).get("spacing_m", 3000.0 + longest)) - longest
+    return {
+        "emergency_distance_m": least, "emergency_zone_m": min(600.0, 0.4 * max(desired - least, 1.0)),
+        "range_m": max([10000.0, *upper]),
+    }  # fmt: skip
+
+
+def _length(kind: Mapping[str, Any]) -> float:
+    units, length = int(kind.get("units", 1)), kind.get("unit_length_m", 0.0)
+    return float(sum(length)) if isinstance(length, list) else units * float(length)
+
+
+def _errors_allowed(data: Mapping[str, Any]) -> list[float]:
+    topology = data.get("topology", {})
+    found = []
+    for place in (topology, *data.get("link", ())):
+        desired = place.get("desired_m", topology.get("spacing_m"))
+        if desired is not None:
+            found += [float(place[key]) - float(desired) for key in ("lower_m", "upper_m") if np.isfinite(place.get(key, np.inf))]
+    return found

@@ -1,0 +1,90 @@
+"""Which trains of a SUMO configuration are followed, what of them is not, and what makes it impossible to follow them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+from sumo_net.netfile import RAIL
+from trainctl.errors import InputError
+from trainctl.traffic.duarouter import STOP_KEYS
+from trainctl.traffic.files import PEOPLE, Demand, is_time, routes_of, types_of
+from trainctl.traffic.kinds import Kind
+from trainctl.traffic.places import Tracks, off_route, place_of, unconnected
+
+#: What a stop may say that changes nothing here.
+_SILENT = {"line", "tripId", "actType", "color", "name", "arrival", "started", "ended", "posLat", "index", "parking"}
+
+
+def rail_trains(demand: Demand, kinds: dict[str, Kind]) -> tuple[list[Element], list[str]]:
+    """The trains among the vehicles, and what is left out."""
+    trains, others = [], 0
+    for train in demand.trains:
+        name = train.get("type", "DEFAULT_VEHTYPE")
+        types = types_of(demand.mixes[name]) if name in demand.mixes else [name]
+        # A type that does not exist is a mistake, told later.
+        rail = [t for t in types if t not in kinds or kinds[t].vclass in RAIL]
+        trains += [train] * bool(rail)
+        others += not rail
+    counts = {word: sum(n for tag, n in demand.seen.items() if PEOPLE.get(tag) == word) for word in ("persons", "containers")}
+    notes = [f"{n} definitions of {word} left out" for word, n in counts.items() if n]
+    notes += [f"{others} vehicles, trips and flows left out: not rail"] if others else []
+    notes += [f"{demand.seen['rerouter']} rerouters not followed"] if demand.seen.get("rerouter") else []
+    places = {t.get("departPos", "") for t in trains} & {"random", "free", "random_free", "last", "splitFront"}
+    notes += [
+        f'departPos="{p}": the train begins with its rear at the beginning of the edge, as with "base"' for p in sorted(places)
+    ]
+    speeds = {t.get("departSpeed", "") for t in trains} & {"random", "last", "avg"}
+    notes += [f'departSpeed="{s}": as fast as allowed' for s in sorted(speeds)]
+    if any(t.get("arrivalPos") == "random" for t in trains):
+        notes.append('arrivalPos="random": at the end of the edge')
+    if n := sum(t.get("arrivalSpeed") is not None for t in trains):
+        notes.append(f"{n} trains, trips and flows with an arrivalSpeed: it is not followed")
+    if n := sum(t.get("speedFactor") is not None for t in trains):
+        notes.append(f"{n} trains, trips and flows with a speedFactor of their own: that of the vType holds")
+    routed = {t.get("route", "") for t in trains}
+    stops = [s for t in trains for s in t.iter("stop")] + [
+        s for r in routed & set(demand.routes) for s in demand.routes[r].iter("stop")
+    ]
+    for key in sorted({key for s in stops for key, value in s.items() if value not in ("0", "false")} - STOP_KEYS - _SILENT):
+        notes.append(f"{key} of stops is not followed")
+    drawn = {t.get("type", "") for t in trains}
+    drawn |= {member for name in drawn & set(demand.mixes) for member in types_of(demand.mixes[name])}
+    for name in sorted(drawn & set(kinds)):
+        if "(" in (text := kinds[name].attributes.get("speedFactor", "")):
+            notes.append(f"vType {name}: speedFactor = {text}: its mean {kinds[name].speed_factor:g} for every train")
+    return trains, notes
+
+
+def refuse(sumocfg: Path, trains: list[Element], demand: Demand, kinds: dict[str, Kind], tracks: Tracks) -> None:
+    """Refuse trains whose names, types, times, routes or stops cannot be: one line for each mistake."""
+    if not trains:
+        raise InputError(f"{sumocfg}: no trains: no vehicle, trip or flow has a vType of a rail class ({', '.join(sorted(RAIL))})")
+    wrong = []
+    seen = Counter(train.get("id", "") for train in trains)
+    for train in trains:
+        who = f"{'flow' if train.tag == 'flow' else 'train'} {train.get('id', '')}"
+        name = train.get("type", "DEFAULT_VEHTYPE")
+        types = types_of(demand.mixes[name]) if name in demand.mixes else [name]
+        wrong += [f"{who}: type = {t}: no such vType" for t in types if t not in kinds]
+        if seen[train.get("id", "")] > 1:
+            wrong.append(f"{who}: there are several of this id")
+        depart = train.get("depart", train.get("begin", "0"))
+        if depart != "begin" and not is_time(depart):
+            wrong.append(f"{who}: depart = {depart}: must be a time; what a train is to wait for is not known before the run")
+        routes = routes_of(train, demand)
+        if train.get("route") and not routes:
+            wrong.append(f"{who}: route = {train.get('route')}: no such route")
+        ends = [*train.get("from", "").split(), *train.get("via", "").split(), *train.get("to", "").split()]
+        wrong += [f"{who}: edge {e}: not in the net" for e in ends if e not in tracks.onward]
+        wrong += [f"{who}: {m}" for s in train.iter("stop") if (m := place_of(s, demand, tracks).wrong)]
+        for route in routes:
+            wrong += [f"{who}: {m}" for m in unconnected(route.get("edges", "").split(), tracks)]
+            stops = [*route.iter("stop"), *(s for s in train if s.tag == "stop")]
+            places = [place_of(s, demand, tracks) for s in stops]
+            wrong += [f"{who}: {p.wrong}" for p in places if p.wrong]
+            if not route.get("repeat") and not any(p.wrong for p in places):
+                wrong += [f"{who}: {m}" for m in off_route(tuple(route.get("edges", "").split()), places)]
+    if wrong:
+        raise InputError(list(dict.fromkeys(wrong)))

@@ -1,0 +1,139 @@
+"""Flows, trips and distributions made into vehicles with routes, by SUMO's ``duarouter``.
+
+It is handed routes, stops and times alone: it leaves out trains with a ``line`` without a word.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+from sumo_net.build import program
+from sumo_net.spec import LineError
+from trainctl.errors import InputError
+from trainctl.traffic.files import PLACES, Demand, parse, seconds
+
+#: Seconds after which duarouter is taken for stuck.
+PATIENCE_S = 300.0
+
+#: What duarouter needs of a train.
+_TRAIN_KEYS = {
+    "id", "type", "depart", "begin", "end", "period", "number", "vehsPerHour", "perHour", "probability", "route", "from", "to",
+    "via", "fromJunction", "toJunction", "viaJunctions",
+}  # fmt: skip
+#: What it needs of a route.
+_ROUTE_KEYS = {"id", "edges", "probability", "repeat", "cycleTime", "refId"}
+#: What it needs of a stop.
+STOP_KEYS = {"lane", "edge", "startPos", "endPos", "friendlyPos", "duration", "until", *PLACES}
+
+
+def expand(
+    trains: list[Element], demand: Demand, net: Path, work: Path, begin: float, end: float | None, seed: int
+) -> list[Element]:
+    """The vehicles duarouter makes of the trains."""
+    work.mkdir(parents=True, exist_ok=True)
+    more, routes = Element("additional"), Element("routes")
+    more.extend(demand.places.values())
+    named = {id(t) for mix in demand.mixes.values() for t in mix}
+    more.extend(t for t in demand.types.values() if id(t) not in named)
+    more.extend(demand.mixes.values())
+    drawn = {id(r) for mix in demand.drawn.values() for r in mix}
+    routes.extend(_route(r) for r in demand.routes.values() if id(r) not in drawn)
+    for mix in demand.drawn.values():
+        routes.append(_mix(mix))
+    for train in trains:
+        # duarouter ends with an error at a flow that begins too late for it.
+        if train.tag == "flow" and end is not None and "end" not in train.attrib and seconds(train.get("begin", "0")) >= end:
+            continue
+        bare = _bare(train, _TRAIN_KEYS)
+        for child in train:
+            if child.tag == "stop":
+                bare.append(_bare(child, STOP_KEYS))
+            elif child.tag == "route":
+                bare.append(_route(child))
+            elif child.tag == "routeDistribution":
+                bare.append(_mix(child))
+        routes.append(bare)
+    for name, element in (("stops.add.xml", more), ("demand.rou.xml", routes)):
+        ElementTree.ElementTree(element).write(work / name, encoding="utf-8")
+    options = {
+        "net-file": str(net.resolve()), "additional-files": "stops.add.xml", "route-files": "demand.rou.xml",
+        "output-file": "trains.rou.xml",
+        "begin": f"{begin:.3f}", "seed": str(seed), "precision": "9", "xml-validation": "never", "no-step-log": "true",
+        "unsorted-input": "true", "ignore-errors": "true",
+        "skip-new-routes": "true",  # otherwise it draws between the route a train is given and a shorter one
+    }  # fmt: skip
+    if any(key.endswith(("Junction", "Junctions")) for train in trains for key in train.keys()):  # noqa: SIM118
+        options["junction-taz"] = "true"
+    if end is not None:
+        options["end"] = f"{end:.3f}"
+    made = work / "trains.rou.xml"
+    made.unlink(missing_ok=True)
+    try:
+        duarouter, environment = program("duarouter")
+        command = [str(duarouter), *(word for key, value in options.items() for word in (f"--{key}", value))]
+        done = subprocess.run(command, cwd=work, env=environment, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
+    except LineError as error:
+        raise InputError(error.mistakes) from None
+    except subprocess.TimeoutExpired:
+        raise InputError(f"duarouter: no end after {PATIENCE_S:g} s; does a flow have no end?") from None
+    wrong = _told(done.stderr, {train.get("id", ""): train.tag for train in trains})
+    if wrong:
+        raise InputError(wrong)
+    if done.returncode != 0 or not made.exists():
+        if "No route input" in done.stderr:
+            return []
+        raise InputError(
+            [f"duarouter: {line}" for line in done.stderr.splitlines() if line.startswith("Error")] or ["duarouter failed"]
+        )
+    return [e for e in parse(made) if e.tag == "vehicle"]
+
+
+def _bare(element: Element, keys: set[str]) -> Element:
+    return Element(element.tag, {key: value for key, value in element.items() if key in keys})
+
+
+def _route(route: Element) -> Element:
+    bare = _bare(route, _ROUTE_KEYS)
+    bare.extend(_bare(s, STOP_KEYS) for s in route.iter("stop"))
+    return bare
+
+
+def _mix(mix: Element) -> Element:
+    bare = _bare(mix, {"id", "routes", "probabilities", "last"})
+    bare.extend(_route(r) for r in mix.iter("route"))
+    return bare
+
+
+def _told(words: str, tags: dict[str, str]) -> list[str]:
+    """Mistakes in what duarouter says, by train: the first line of several about one says the most."""
+    patterns = (
+        (r"Mandatory edge '(.*)' not reachable by vehicle '(.*)'\.", "edge {0} cannot be reached"),
+        (r"Vehicle '(.*)' is not allowed to (.*)\.", "is not allowed to {0}"),
+        (r"The route for vehicle '(.*)' has no edges", "no route"),
+        (r"The route of the vehicle '(.*)' is not known", "no route"),
+        (r"The vehicle '(.*)' has no valid route", "no route"),
+    )
+    wrong: dict[str, str] = {}
+    gap = ""
+    for line in words.splitlines():
+        _, _, said = line.partition(": ")
+        if found := re.match(r"No connection between edge '(.*)' and edge '(.*)' found", said):
+            gap = f"no way from edge {found[1]} to edge {found[2]}"
+            continue
+        for pattern, meaning in patterns:
+            if found := re.match(pattern, said):
+                name, *rest = found.groups() if not pattern.startswith("Mandatory") else found.groups()[::-1]
+                name = name if name in tags else name.rpartition(".")[0]
+                who = f"{'flow' if tags.get(name) == 'flow' else 'train'} {name}"
+                wrong.setdefault(who, f"{who}: {gap or meaning.format(*(r.replace(chr(39), '') for r in rest))}")
+                gap = ""
+                break
+        else:
+            follows = said.startswith(("No route input", "Loading of", "Invalid parsing", "vehicle cannot be created"))
+            if line.startswith("Error") and not follows:
+                wrong.setdefault(said, f"duarouter: {said}")
+    return list(wrong.values())

@@ -1,0 +1,107 @@
+"""Where the routes and stops of a SUMO configuration lie on its net, and why some lie nowhere."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
+
+from sumo_net.netfile import RAIL, read_net
+from sumo_net.spec import LineError
+from trainctl.errors import InputError
+from trainctl.traffic.files import PLACES, Demand, bad_time
+
+
+class Tracks(NamedTuple):
+    """What a net says of connections."""
+
+    length: dict[str, float]  # of lanes [m]
+    onward: dict[str, set[str]]  # from each edge
+
+
+class Place(NamedTuple):
+    """Where a train stops."""
+
+    lane: str
+    position_m: float  # of its front, from the beginning of the lane
+    wrong: str  # why it cannot stop there, or ""
+
+
+def read_tracks(net: Path) -> Tracks:
+    """Lanes and connections of a net with rail edges."""
+    try:
+        file = read_net(net)
+    except LineError as error:
+        raise InputError(error.mistakes) from None
+    if not any(not RAIL.isdisjoint(lane.get("allow", "").split()) for edge in file.edges for lane in edge.lanes):
+        raise InputError(f"{net}: has no rail edges: none of its lanes allows a rail class by name")
+    onward: dict[str, set[str]] = {edge.attributes.get("id", ""): set() for edge in file.edges}
+    try:
+        length = {lane["id"]: float(lane["length"]) for edge in file.edges for lane in edge.lanes}
+        for c in file.connections:
+            onward.setdefault(c["from"], set()).add(c["to"])
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{net}: not a SUMO net: a lane or a connection has no {error}") from None
+    return Tracks(length, onward)
+
+
+def place_of(stop: Element, demand: Demand, tracks: Tracks) -> Place:
+    """Where a stop is: at a place with a name, or on a lane or an edge."""
+    for tag in PLACES:
+        if (name := stop.get(tag)) is not None:
+            # SUMO takes a train stop for a bus stop, and duarouter writes it so.
+            if name not in demand.places:
+                return Place("", 0.0, f"stop at {tag} {name}: no such {tag}")
+            where = demand.places[name]
+            break
+    else:
+        where, name = stop, ""
+    lane = where.get("lane") or (f"{where.get('edge')}_0" if where.get("edge") else "")
+    said = f"stop at {name}" if name else f"stop on edge {lane.rpartition('_')[0]}"
+    if not lane:
+        return Place(lane, 0.0, "a stop has neither a lane nor an edge nor a place to stop at")
+    if lane not in tracks.length:
+        return Place(lane, 0.0, f"{said}: lane {lane}: not in the net")
+    length = tracks.length[lane]
+    said_wrong = [f"{key} = {stop.get(key)}" for key in ("duration", "until") if bad_time(stop.get(key, "0"))]
+    try:
+        position = float(where.get("endPos", length))
+    except ValueError:
+        said_wrong.append(f"endPos = {where.get('endPos')}")
+        position = 0.0
+    if said_wrong:
+        return Place(lane, 0.0, f"{said}: {', '.join(said_wrong)}: must be a number, a time not negative")
+    position += length if position < 0 else 0.0
+    if where.get("friendlyPos", "0").lower() in ("1", "true", "yes", "on", "x", "t"):
+        position = min(max(position, 0.0), length)
+    # SUMO itself lets a stop be a bit beyond the end.
+    if not 0.0 <= position <= length + 0.1:
+        return Place(lane, 0.0, f"{said}: endPos = {where.get('endPos')}: off the edge, which is {length:g} m long")
+    wrong = ""
+    if not name and stop.get("duration") is None and stop.get("until") is None:
+        wrong = f"{said}: neither duration nor until"
+    return Place(lane, min(position, length), wrong)
+
+
+def unconnected(edges: list[str], tracks: Tracks) -> list[str]:
+    """Mistakes in a route: edges that are not in the net, else those that do not follow each other there."""
+    unknown = [f"edge {e}: not in the net" for e in edges if e not in tracks.onward]
+    return unknown or [
+        f"its route is not connected: no way from edge {a} to edge {b}" for a, b in pairwise(edges) if b not in tracks.onward[a]
+    ]
+
+
+def off_route(edges: tuple[str, ...], places: list[Place]) -> list[str]:
+    """Stops that a train does not come to, one after the other."""
+    wrong, at, behind = [], 0, 0.0
+    for place in places:
+        edge = place.lane.rpartition("_")[0]
+        start = at + 1 if edges[at : at + 1] == (edge,) and place.position_m < behind else at
+        if edge in edges[start:]:
+            at, behind = edges.index(edge, start), place.position_m
+        elif edge in edges:
+            wrong.append(f"stop on edge {edge} at {place.position_m:g} m: lies behind the stop before")
+        else:
+            wrong.append(f"stop on edge {edge}: not on its route")
+    return wrong

@@ -1,0 +1,226 @@
+"""The trains of a SUMO configuration, every one of them known before the run.
+
+``duarouter`` expands flows into trains, trips into routes, and draws from distributions. What it is not handed is taken from the
+files and joined by id.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
+
+from sumo_net.netfile import RAIL
+from trainctl.errors import InputError
+from trainctl.traffic.checks import rail_trains, refuse
+from trainctl.traffic.duarouter import expand
+from trainctl.traffic.files import PLACES, Demand, bad_number, is_number, is_time, named_files, read_demand, read_options, seconds
+from trainctl.traffic.kinds import Kind, default_types, kind_of
+from trainctl.traffic.places import Tracks, off_route, place_of, read_tracks, unconnected
+
+#: What SUMO takes in place of a number; the first is its default.
+_WORDS = {
+    "departPos": ("base", "stop", "random", "free", "random_free", "last", "splitFront"),
+    "departSpeed": ("max", "desired", "speedLimit", "last", "avg", "random"),
+    "arrivalPos": ("max", "random", "center"),
+}
+
+
+class Stop(NamedTuple):
+    """Where a train waits."""
+
+    edge: str
+    position_m: float  # its front, from the beginning of the edge
+    duration_s: float  # at least
+    until_s: float | None  # not before
+    name: str  # of the train stop, or ""
+
+
+class Departure(NamedTuple):
+    """A train as SUMO would let it in."""
+
+    id: str
+    kind: str  # its vType
+    depart_s: float
+    edges: tuple[str, ...]  # its route, without internal edges
+    position_m: float  # of its front on the first edge
+    speed_mps: float | None  # None: as fast as allowed
+    stops: tuple[Stop, ...]
+    arrival_m: float | None  # where on the last edge it leaves; None: at its end
+    line: str
+
+
+class Traffic(NamedTuple):
+    """The trains of a configuration."""
+
+    net: Path
+    departures: tuple[Departure, ...]  # by time, then as in the files
+    kinds: dict[str, Kind]
+    begin_s: float
+    end_s: float | None
+    step_s: float
+    notes: tuple[str, ...]  # what is not followed
+
+
+def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, seed: int = 42) -> Traffic:
+    """What a SUMO configuration says of its trains.
+
+    Parameters
+    ----------
+    sumocfg : Path
+        The configuration; the files it names lie relative to its folder.
+    work : Path
+        Folder for what ``duarouter`` reads and writes; made if it is not there.
+    duration_s : float, optional
+        Departures this long after the configuration's begin, or later, are of no interest [s]; its own end holds as well.
+    seed : int
+        Of all that is drawn: the same seed gives the same trains.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or is not what it should be, or trains, routes and stops do not fit the net: one line for each.
+    """
+    options = read_options(sumocfg)
+    net, routes, more = (named_files(sumocfg, options, key) for key in ("net-file", "route-files", "additional-files"))
+    wrong = [f"{sumocfg}: no {key}" for key, files in (("net-file", net), ("route-files", routes)) if not files]
+    wrong += [f"{sumocfg}: {path}: no such file" for path in (*net, *routes, *more) if not path.is_file()]
+    times = {}
+    for key, missing in (("begin", "0"), ("end", "-1"), ("step-length", "1")):
+        said = options.get(key, missing)
+        times[key] = seconds(said) if is_time(said) else math.nan
+        if not (times[key] > 0 if key == "step-length" else math.isfinite(times[key])):
+            wrong.append(f"{sumocfg}: {key} = {said}: must be a time{', above 0' if key == 'step-length' else ''}")
+    if wrong:
+        raise InputError(wrong)
+    begin, own_end = times["begin"], times["end"] if times["end"] >= 0 else None
+    ends = [e for e in (own_end, None if duration_s is None else begin + duration_s) if e is not None]
+    tracks = read_tracks(net[0])
+    demand = read_demand([*more, *routes])
+    wrong = [
+        f"vType {name}: {key} = {element.get(key)}: must be a number, not negative"
+        for name, element in demand.types.items()
+        for key in ("length", "maxSpeed")
+        if bad_number(element.get(key))
+    ]
+    if wrong:
+        raise InputError(wrong)
+    kinds = {name: kind_of(element) for name, element in (default_types() | demand.types).items()}
+    trains, notes = rail_trains(demand, kinds)
+    refuse(sumocfg, trains, demand, kinds, tracks)
+    expanded = expand(trains, demand, net[0], work, begin, min(ends) if ends else None, seed)
+    order = {train.get("id", ""): k for k, train in enumerate(trains)}
+    made = {vehicle.get("id", "") for vehicle in expanded}
+    made |= {name.rpartition(".")[0] for name in made}
+    departures = []
+    wrong = [
+        f"{'flow' if t.tag == 'flow' else 'train'} {t.get('id')}: duarouter makes no route of it; are all its edges for its vClass?"
+        for t in trains
+        if t.get("id") not in made and _comes(t, begin, min(ends, default=math.inf))
+    ]
+    for vehicle in expanded:
+        name = vehicle.get("id", "")
+        source = trains[order[name if name in order else name.rpartition(".")[0]]]
+        kind = kinds[vehicle.get("type", "DEFAULT_VEHTYPE")]
+        if kind.vclass not in RAIL:
+            continue
+        train, mistakes = _departure(vehicle, source, kind, demand, tracks)
+        departures.append((order[source.get("id", "")], train))
+        wrong += mistakes
+    if wrong:
+        raise InputError(list(dict.fromkeys(wrong)))
+    if not departures:
+        until = f" and before end = {min(ends):g}" if ends else ""
+        raise InputError(f"{sumocfg}: no train departs at begin = {begin:g} or later{until}")
+    departures.sort(key=lambda d: (d[1].depart_s, d[0]))
+    used = {d.kind for _, d in departures}
+    return Traffic(
+        net=net[0],
+        departures=tuple(d for _, d in departures),
+        kinds={name: kind for name, kind in kinds.items() if name in used},
+        begin_s=begin,
+        end_s=own_end,
+        step_s=times["step-length"],
+        notes=tuple(notes),
+    )
+
+
+def _departs(train: Element, begin: float) -> float:
+    depart = train.get("depart", "begin")
+    return begin if depart == "begin" else seconds(depart)
+
+
+def _comes(train: Element, begin: float, end: float) -> bool:
+    """Whether a train, or one of a flow, must depart between these times; of a flow that is drawn nobody can tell."""
+    if train.tag != "flow":
+        return begin <= _departs(train, begin) < end
+    sure = train.get("number", "1") != "0" and "probability" not in train.attrib
+    return sure and begin <= seconds(train.get("begin", "0")) < min(end, seconds(train.get("end", "inf")))
+
+
+def _departure(vehicle: Element, source: Element, kind: Kind, demand: Demand, tracks: Tracks) -> tuple[Departure, list[str]]:
+    """A train out of what duarouter wrote and what the file said, and the mistakes in it."""
+    name, route = vehicle.get("id", ""), vehicle.find("route")
+    edges = () if route is None else tuple(route.get("edges", "").split())
+    places = [place_of(stop, demand, tracks) for stop in vehicle.iter("stop")]
+    wrong = [f"train {name}: {m}" for m in (*unconnected(list(edges), tracks), *off_route(edges, places))]
+    stops = [
+        Stop(
+            edge=place.lane.rpartition("_")[0],
+            position_m=place.position_m,
+            duration_s=max(seconds(stop.get("duration", "0")), 0.0),
+            until_s=seconds(stop.get("until", "")) if stop.get("until") else None,
+            name=next((stop.get(tag, "") for tag in PLACES if stop.get(tag)), ""),
+        )
+        for stop, place in zip(vehicle.iter("stop"), places, strict=True)
+    ]
+    departure = Departure(
+        id=name,
+        kind=kind.id,
+        depart_s=seconds(vehicle.get("depart", "0")),
+        edges=edges,
+        position_m=0.0,
+        speed_mps=None,
+        stops=tuple(stops),
+        arrival_m=None,
+        line=source.get("line", ""),
+    )
+    if wrong:
+        return departure, wrong
+    first, last = (tracks.length[f"{e}_0"] for e in (edges[0], edges[-1]))
+    wrong = [
+        f"train {name}: {key} = {source.get(key)}: must be a number or one of {', '.join(known)}"
+        for key, known in _WORDS.items()
+        if source.get(key, known[0]) not in known and not is_number(source.get(key, ""))
+    ]
+    if source.get("departSpeed", "0").startswith("-"):
+        wrong.append(f"train {name}: departSpeed = {source.get('departSpeed')}: must not be negative")
+    if wrong:
+        return departure, wrong
+    position = _depart_position(source.get("departPos", "base"), kind.length_m, first, departure)
+    arrival = source.get("arrivalPos", "max")
+    arrival_m = last / 2 if arrival == "center" else None
+    if is_number(arrival):
+        arrival_m = min(max(float(arrival) + (last if float(arrival) < 0 else 0.0), 0.0), last)  # as in SUMO
+    # Without a word of it SUMO lets a train begin as fast as it may (measured; its documentation says 0).
+    speed = source.get("departSpeed", "max")
+    speed_mps = float(speed) if is_number(speed) else None
+    if not 0.0 <= position <= first:
+        wrong.append(f"train {name}: departPos = {source.get('departPos')}: off edge {edges[0]}, which is {first:g} m long")
+    if stops and stops[0].edge == edges[0] and position >= stops[0].position_m:
+        speed_mps = 0.0
+    return departure._replace(position_m=position, arrival_m=arrival_m, speed_mps=speed_mps), wrong
+
+
+def _depart_position(said: str, length: float, first: float, departure: Departure) -> float:
+    """Front of the train on its first edge [m]."""
+    stop = departure.stops[0] if departure.stops and departure.stops[0].edge == departure.edges[0] else None
+    if said == "stop" and stop is not None:
+        return stop.position_m
+    if said in _WORDS["departPos"]:
+        # SUMO puts the rear a bit behind the beginning of the edge, but no farther than the first stop.
+        base = min(length + 0.1, first)
+        return base if stop is None else min(base, stop.position_m)
+    position = float(said)
+    return position + first if position < 0 else position
