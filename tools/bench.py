@@ -234,10 +234,10 @@ def inputs(folder: Path, case: str, trains: int, steps: int) -> None:
     """Write what SUMO alone needs into ``folder``: net, trains and configuration, as a run does."""
     import sumo_net
     from trainctl.loop import Simulation
+    from trainctl.numeric import Numeric
     from trainctl.scenario.build import open_scenario
     from trainctl.stages.record import Journal
     from trainctl.sumo.session import LOGS, write_configuration, write_routes
-    from trainctl.world import Numeric
 
     prepared = open_scenario(str(folder / "scenario.toml"))
     sumo_net.build(prepared.spec, folder)

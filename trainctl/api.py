@@ -174,7 +174,7 @@ class Simulation:
         Ids, in the order of all arrays.
     """
 
-    def __init__(self, stack: ExitStack, simulation: loop.Simulation, out: Path | None) -> None:
+    def __init__(self, stack: ExitStack, simulation: loop.Loop, out: Path | None) -> None:
         self._stack, self._loop, self._out = stack, simulation, out
         self._open = True
         self.trains: tuple[str, ...] = tuple(simulation.p.scenario.ids)
@@ -226,7 +226,7 @@ class Simulation:
     @property
     def speed_mps(self) -> Floats:
         """Speed of every train's head, shape (n,)."""
-        return np.asarray(self._loop.own[self._loop.p.heads, SPEED].copy())
+        return np.asarray(self._loop.state.own[self._loop.p.heads, SPEED].copy())
 
     @property
     def track(self) -> list[str]:
@@ -248,7 +248,7 @@ class Simulation:
     @property
     def units(self) -> pd.DataFrame:
         """One row per unit: train, unit, position_m, speed_mps."""
-        first, own = self._loop.p.consists.first, self._loop.own
+        first, own = self._loop.p.consists.first, self._loop.state.own
         names = [(name, k + 1) for name, (a, b) in zip(self.trains, pairwise(first), strict=True) for k in range(b - a)]
         frame = pd.DataFrame(names, columns=["train", "unit"])
         return frame.assign(position_m=own[:, POSITION], speed_mps=own[:, SPEED])
@@ -256,7 +256,7 @@ class Simulation:
     @property
     def links(self) -> pd.DataFrame:
         """Who hears whom in the last step: sender, receiver, spacing_m, desired_m, lower_m, upper_m, heard."""
-        links = self._loop.links
+        links = self._loop.state.formed.links
         if links is None:  # before the first step
             links = self._loop.p.first_links
         names, x = np.array(self.trains, dtype=object), self.position_m
@@ -293,11 +293,11 @@ class Simulation:
         values = np.array([float(a) for a in acceleration_mps2.values()])
         if not np.isfinite(values).all():
             raise InputError("acceleration_mps2: must be finite")
-        self._loop.outside[numbers] = values
+        self._loop.command(numbers, values)
 
     def release(self, *trains: str) -> None:
         """Give trains back to the law, from its next control instant on; without names, all."""
-        self._loop.outside[[self._number(t) for t in trains] if trains else slice(None)] = np.nan
+        self._loop.command([self._number(t) for t in trains] if trains else slice(None), np.nan)
 
     def reroute(
         self,
@@ -338,7 +338,7 @@ class Simulation:
             )  # fmt: skip
         except ValidationError as error:
             raise InputError([f"reroute: {line}" for line in mistakes(error, {}, "", Event)]) from None
-        loop.reroutes.add(event)
+        loop.order(event)
 
     def close(self) -> Run | None:
         """End the simulation; the run folder, if ``out`` was given."""

@@ -21,8 +21,9 @@ import sumo_net
 from sumo_net import LineError
 from sumo_net.netfile import unpack
 from trainctl.errors import InputError, SimulatorError
-from trainctl.loop import Simulation
+from trainctl.loop import Loop
 from trainctl.metrics.run import metrics
+from trainctl.numeric import Numeric
 from trainctl.record import checkpoint
 from trainctl.record.folder import (
     about_run,
@@ -41,7 +42,7 @@ from trainctl.scenario import promise, roster
 from trainctl.scenario.build import Prepared, prepare
 from trainctl.scenario.reading import examine
 from trainctl.stages.record import Journal
-from trainctl.world import Numeric, World
+from trainctl.world import World
 
 Backend = Literal["sumo", "numeric"]
 
@@ -110,7 +111,7 @@ def opened(
     command_line: Sequence[str] = (),
     gui: str | None = None,
     checkpoint_every_s: float | None = None,
-) -> Iterator[Simulation]:
+) -> Iterator[Loop]:
     """A run folder and the loop in it, for whoever drives it; arguments and errors as in ``run``.
 
     When the block ends the run is complete; when it raises, the run failed.
@@ -195,7 +196,7 @@ def resume(folder: Path, progress: Callable[[int, int], Any] | None = None) -> t
 @contextmanager
 def _driven(
     p: Prepared, partial: Path, info: dict[str, Any], gui: str | None, every_s: float | None, saved: checkpoint.Saved | None
-) -> Iterator[Simulation]:
+) -> Iterator[Loop]:
     """The loop in its folder, from the beginning or from a checkpoint, and what is left to do when it has ended."""
     place = partial / checkpoint.FOLDER
     # not zeros: some file systems keep no room for those
@@ -212,13 +213,11 @@ def _driven(
             world = open_world(p, partial, info["backend"], gui)
             if every_s is not None:
                 world = tape = checkpoint.Tape(world, place, saved)
+            journal.silent = saved is not None  # what a run told when it began is written already
+            simulation = Loop(p, world, journal)
             if saved is not None and tape is not None:
-                unheard: Any = checkpoint.Unheard()
-                simulation = Simulation(p, world, unheard)
                 checkpoint.restore(simulation, tape, saved)
-                simulation.journal = journal
-            else:
-                simulation = Simulation(p, world, journal)
+            journal.silent = False
             simulation.between = _Between(simulation, journal, tape, place, every_s, stop, elapsed)
             stop.waits = True
             yield simulation
@@ -226,9 +225,9 @@ def _driven(
             world.close()
             for at, message in world.messages():
                 journal.event(simulation.time if at is None else at, "sumo_warning", message=message)
-            for at, alarm in simulation.alarms.counted(simulation.time, world.collisions()):
+            for at, alarm in simulation.counted(world.collisions()):
                 journal.event(at, "violation", **alarm)
-            end = {"steps": simulation.k, **simulation.alarms.outcome(simulation.not_entered)}
+            end = {"steps": simulation.k, **simulation.outcome()}
             done = {"end": end, "wall_time_s": elapsed(), "recorder": journal.recorder.cut()}
             checkpoint.replace(place / checkpoint.DONE, json.dumps(plain(done)).encode())
             journal.close()
@@ -262,7 +261,7 @@ class _Between:
     """What happens between two steps: a checkpoint if one is due, an end if one was asked for."""
 
     def __init__(
-        self, simulation: Simulation, journal: Journal, tape: checkpoint.Tape | None, place: Path, every_s: float | None,
+        self, simulation: Loop, journal: Journal, tape: checkpoint.Tape | None, place: Path, every_s: float | None,
         stop: _Stop, elapsed: Callable[[], float],
     ) -> None:  # fmt: skip
         self.simulation, self.journal, self.tape, self.place, self.stop, self.elapsed = (
@@ -324,7 +323,7 @@ def begin(partial: Path, p: Prepared, every_s: float | None) -> None:
         start["net"] = unpack(p.net, place).name
     else:
         start["line"] = p.spec.model_dump(mode="json", by_alias=True, exclude_none=True)
-    if p.roster is not None:
+    if not p.placed:
         start["roster"] = roster.tables(p.roster)
     checkpoint.replace(place / checkpoint.START, json.dumps(start).encode())
 
@@ -378,7 +377,7 @@ def open_world(p: Prepared, folder: Path, backend: Backend, gui: str | None = No
     if gui is not None:
         from trainctl.sumo.gui import Gui, Map
 
-        return (Gui if p.roster is None else Map)(p.line, net, place, run.step_s, run.steps, run.record_every_s, gui)
+        return (Gui if p.placed else Map)(p.line, net, place, run.step_s, run.steps, run.record_every_s, gui)
     return Sumo(p.line, net, place, run.step_s, run.steps, run.record_every_s)
 
 

@@ -290,3 +290,132 @@ class Plant(Protocol):
 #: What ``Plant.rate`` writes into ``power``; each is the rate of an energy [W]. Kinetic plus coupler energy changes by
 #: traction - braking - resistance - damping - gradient + disturbance.
 POWERS = ("traction", "braking", "resistance", "damping", "gradient", "disturbance")
+
+
+class Start(NamedTuple):
+    """Trains as they are put on the line, one row per train."""
+
+    ids: Sequence[str]
+    edge: Ints  # (n,) index into line.edges
+    lane_position: Floats  # (n,) m, front, from the beginning of the edge
+    speed: Floats  # (n,) m/s
+    length: Floats  # (n,) m
+    unit_length: Sequence[Floats]  # m, of each train's units, for the picture
+    routes: Sequence[tuple[str, ...]]  # edge ids from the edge a train starts on, internal ones included
+    present: Bools  # (n,) the others come later
+    vclass: Sequence[str]  # SUMO's class of vehicle
+
+
+class Seen(NamedTuple):
+    """What is measured of all trains, shape (n,). Of trains that are not there it is where they will come or have left."""
+
+    position: Floats  # m on the line, front
+    edge: Ints  # index into line.edges
+    row: Ints  # of the edge it is on in the ways
+    present: Bools
+
+
+class Disturbed(NamedTuple):
+    """What acts in one step, shape (n,)."""
+
+    position: Floats  # w1 [m]
+    speed: Floats  # w2 [m/s]
+    input: Floats  # w3 [m/s2]
+    resistance: Floats  # true over believed resistance, 1 if undisturbed
+    measurement: Floats  # measured minus true position [m]
+
+    def calm(self) -> Disturbed:
+        """The same step without what disturbs the motion: what can be known of it before."""
+        none = np.zeros_like(self.position)
+        return Disturbed(none, none, none, np.ones_like(none), self.measurement)
+
+
+class Extremes(NamedTuple):
+    """Over the sub-steps since they were last reset: a once-a-second sample hides peaks."""
+
+    coupler_min: Floats  # (U,) m
+    coupler_max: Floats
+    force_min: Floats  # (U,) N
+    force_max: Floats
+    watched_min: Floats  # (n, q) the law's constrained quantities
+    watched_max: Floats
+    limited: Floats  # (n,) s, time during which a unit limit acted
+    energy: Floats  # (n, 6) J, see signals.POWERS
+    watched: Floats  # (n, q) the constrained quantities when last seen
+
+    @classmethod
+    def fresh(cls, trains: int, units: int, watched: int) -> Extremes:
+        """Nothing seen yet."""
+        low, high = np.full(units, np.inf), np.full(units, -np.inf)
+        return cls(
+            low, high, low.copy(), high.copy(), np.full((trains, watched), np.inf), np.full((trains, watched), -np.inf),
+            np.zeros(trains), np.zeros((trains, len(POWERS))), np.full((trains, watched), np.nan),
+        )  # fmt: skip
+
+
+class Motion(NamedTuple):
+    """One simulator step of all trains."""
+
+    displacement: Floats  # (n,) m, what SUMO is told to do
+    input: Floats  # (n,) m/s2, force of the whole train per mass at the beginning of the step
+    acceleration: Floats  # (n,) m/s2, mean over the step
+    asked: Floats  # (n,) m/s2, what drives the train, as the supervisor judges it
+    limited: Bools  # (n,) a limit of the plant acted
+    clipped: Bools  # (n,) the train would have moved backwards
+    force: Floats | None  # (U,) N at the beginning of the step
+    extras: dict[str, Floats]  # further columns of the units, (U,) each
+
+
+class Messages(NamedTuple):
+    """Messages between trains: under way, and what each link brought last."""
+
+    sent: tuple[Floats, ...]  # (n, w) each, oldest first
+    heard: Floats  # (L, w)
+    ever: Bools  # (L,) it has brought something
+
+
+class Pace(NamedTuple):
+    """Reference of every train's own formation now, shape (n,)."""
+
+    position: Floats  # m
+    speed: Floats  # m/s
+    acceleration: Floats  # m/s2
+
+
+class Formed(NamedTuple):
+    """Who drives with whom: the formations, their links and references, and what the law made of them."""
+
+    links: Links | None  # None: not sorted yet
+    formation: Ints  # (n,) equal for members of one formation
+    ahead: Ints  # (n,) train ahead in the formation, -1: none
+    led: Bools  # (n,) the law drives it
+    offset: Floats  # (n,) m, added to the position along the own route, so that spacings in a formation are right
+    pace: Pace | None  # references of the formations; None: all follow that of the scenario
+    constants: Any  # of the law
+    made_of: tuple[float, Floats, Links] | None  # time, own state and links that the constants were made of
+
+    def after(self, step: float, theta: float) -> Formed:
+        """A step later: the references have gone on."""
+        if self.pace is None:
+            return self
+        v, a = self.pace.speed, self.pace.acceleration
+        speed = v + a * step
+        way = ((1.0 - theta) * v + theta * speed) * step
+        return self._replace(pace=self.pace._replace(position=self.pace.position + way, speed=speed))
+
+
+class Row(NamedTuple):
+    """One instant: the state that holds at ``time`` and what is applied from then on (None at the end)."""
+
+    time: float  # s
+    seen: Seen
+    track: Ints  # (n,)
+    own: Floats  # (U, s)
+    speed: Floats  # (n,) m/s, of the heads
+    ahead: Ints  # (n,) train ahead in the formation, -1 for the first
+    links: Links
+    motion: Motion | None
+    saturated: Bools  # (n,)
+    extremes: Extremes | None  # over the sub-steps since the last row
+    disturbed: Disturbed | None  # what acts from this instant on
+    led: Bools  # (n,) trains the law drives

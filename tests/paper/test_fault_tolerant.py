@@ -25,6 +25,7 @@ from trainctl.controllers import fault_tolerant as law
 from trainctl.observers import asymptotic, intermediate
 from trainctl.plants import actuated_units as plant
 from trainctl.plants import integrate
+from trainctl.signals import Extremes
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +67,7 @@ def small_steps(every: float, duration: float) -> tuple[Example, list[np.ndarray
     loop = integrate.Loop(law_constants, observer, plant.constants(NOISY, s.consists, trains=s.trains))
     own, estimate = s.own.copy(), asymptotic.initial(asymptotic.Params(), s.own)
     air = integrate.Air(np.zeros((2, law.MESSAGE)), True, True, 0.0)
-    work, extremes = integrate.scratch(own, estimate, 3, 5, 4), integrate.Extremes.fresh(3, 9, 3)
+    work, extremes = integrate.scratch(own, estimate, 3, 5, 4), Extremes.fresh(3, 9, 3)
     c, n = s.consists, round(every / 0.002)
     arguments = (loop, c.first, c.length, s.links, s.reference, air, 0.0, 0.002, n, np.zeros(0), own, estimate, work, extremes)
     parts = integrate.compiled(law, asymptotic, plant, arguments)

@@ -42,7 +42,7 @@ from trainctl.claims.robust_constrained import (
 from trainctl.controllers import robust_constrained as law
 from trainctl.controllers import robust_gain
 from trainctl.plants import disturbance, point
-from trainctl.signals import POSITION, SPEED, Floats, Trains
+from trainctl.signals import POSITION, SPEED, Disturbed, Floats, Trains
 
 # --- the example -----------------------------------------------------------------------------------------------------------------
 
@@ -97,7 +97,7 @@ def test_closed_form_covers_resistance_error_measurement_own_gains_and_held_acce
     assert np.abs(alone.error_m) == pytest.approx([3.525, 3.525, 7.05, 0.0, 3.525, 3.525], abs=1e-3)
     constant_[robust_gain.MEASUREMENT] = [3.0, -1.0, 0.5, 0.0]
     constant_[: robust_gain.RESISTANCE] = AMPLITUDE[:3] * 0.5
-    d = disturbance.Disturbed(*constant_[:3], 1.0 + drag, constant_[4])
+    d = Disturbed(*constant_[:3], 1.0 + drag, constant_[4])
     loop = Loop(start, lambda k, x: d)
     loop.constants = law.Constants(h=np.array([0.3, 0.2, 0.25, 0.3]))
     for _ in range(1500 * steps):
@@ -165,7 +165,7 @@ def test_worst_disturbance_attains_the_bound(graph: str, steps: int) -> None:
     count = 1250 * steps  # 1000 s
     signs = law.worst(PARAMS, start, plus, minus, count)
     d = AMPLITUDE[:3, None, :] * signs[:3]
-    loop = Loop(start, lambda k, x: disturbance.Disturbed(*d[:, k], np.ones(N), np.zeros(N)))
+    loop = Loop(start, lambda k, x: Disturbed(*d[:, k], np.ones(N), np.zeros(N)))
     limited = sum(int(loop.step().limited.sum()) for _ in range(count))
     error = loop.error()[0]
     assert limited == 0

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from trainctl.errors import InputError
+from trainctl.numeric import Numeric
 from trainctl.record import checkpoint
 from trainctl.record.checkpoint import Saved, Tape, leaves, refill
 from trainctl.record.folder import claim, free, held, ours, remove, write_info
 from trainctl.runner import again, begin, opened
 from trainctl.scenario.build import open_scenario
-from trainctl.signals import Demand
-from trainctl.world import Numeric, Start
+from trainctl.signals import Demand, Start
 
 
 class Deaf(Numeric):

@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from trainctl.plants import disturbance as d
-from trainctl.signals import Floats
+from trainctl.signals import Disturbed, Floats
 
 IDS = ("1", "2", "3")
 T = 0.5
@@ -22,7 +22,7 @@ def entry(**table: Any) -> d.Disturbance:
     return d.Disturbance.model_validate_json(json.dumps(table))
 
 
-def series(*tables: dict[str, Any], steps: int = 8, seed: int | None = 1, position: Floats = HERE) -> list[d.Disturbed]:
+def series(*tables: dict[str, Any], steps: int = 8, seed: int | None = 1, position: Floats = HERE) -> list[Disturbed]:
     signals = d.prepare([entry(**t) for t in tables], IDS, T, seed)
     return [d.at(signals, k, k * T, position) for k in range(steps)]
 

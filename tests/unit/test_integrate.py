@@ -17,7 +17,7 @@ from scenes import coupled_trains
 from trainctl.controllers import emu_finite_time as law
 from trainctl.observers import none
 from trainctl.plants import coupled_units, integrate, shared
-from trainctl.signals import POWERS, Floats, Reference, Scene
+from trainctl.signals import POWERS, Extremes, Floats, Reference, Scene
 
 JUMP = 0.0137  # s, where the reference below changes its speed: within a sub-step
 
@@ -38,7 +38,7 @@ class Rig:
         self.loop = integrate.Loop(constants, none.Constants(), plant)
         self.air = integrate.Air(np.zeros((len(s.links.sender), part.MESSAGE)), live, False, 0.0)
         self.work = integrate.scratch(self.own, self.estimate, len(s.trains), none.CORRECTIONS, part.MESSAGE)
-        self.extremes = integrate.Extremes.fresh(len(s.trains), len(s.own), len(part.WATCHED))
+        self.extremes = Extremes.fresh(len(s.trains), len(s.own), len(part.WATCHED))
         self.breaks = np.array(breaks)
         self.parts = integrate.compiled(part, none, coupled_units, self._arguments(0.0, 0.01, 1))
 

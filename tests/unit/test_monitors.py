@@ -13,14 +13,10 @@ from trainctl.controllers import emu_finite_time, fault_tolerant
 from trainctl.monitors.bounds import Alarms
 from trainctl.monitors.energy import Balance
 from trainctl.plants.coupled_units import PER_INERTIA
-from trainctl.plants.integrate import Extremes
 from trainctl.railway.ways import ways
 from trainctl.runner import opened
 from trainctl.scenario.build import open_scenario
-from trainctl.signals import POSITION, SPEED
-from trainctl.stages.plant import Motion
-from trainctl.stages.record import Row
-from trainctl.world import Seen
+from trainctl.signals import POSITION, SPEED, Extremes, Motion, Row, Seen
 
 
 def row_of(p, t=0.0, watched=0, **changes):

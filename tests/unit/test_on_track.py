@@ -9,7 +9,7 @@ import pytest
 
 from trainctl.monitors.on_track import Track, Watch, limits, overlaps, track
 from trainctl.railway.ways import ways
-from trainctl.world import Seen
+from trainctl.signals import Seen
 
 #: a (0) and b (1) follow each other, c (2) is b in the other direction; d (3) branches off a.
 LENGTH = np.array([100.0, 200.0, 200.0, 100.0])

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import sumo_net
-from trainctl.world import Numeric, Start
+from trainctl.numeric import Numeric
+from trainctl.signals import Start
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from trainctl.claims.claim import Claim, claim, span
 from trainctl.controllers import emu_finite_time as law
 from trainctl.observers import none
 from trainctl.plants import coupled_units, integrate
-from trainctl.signals import Bounds, Consists, Floats, Links, Reference, Scene
+from trainctl.signals import Bounds, Consists, Extremes, Floats, Links, Reference, Scene
 
 KMH = 1.0 / 3.6
 DAVIS = (0.01176, 7.7616e-4, 1.6e-5)
@@ -66,7 +66,7 @@ class History(NamedTuple):
 
     scene: Scene
     own: Floats  # (seconds + 1, U, 2)
-    extremes: integrate.Extremes
+    extremes: Extremes
     wall: float  # s
 
     def intervals(self) -> Floats:
@@ -93,7 +93,7 @@ def run(scene: Scene, seconds: int, params: law.Params | None = None, step: floa
     )
     air = integrate.Air(np.zeros((len(links.sender), law.MESSAGE)), period is None, False, 0.0)
     work = integrate.scratch(own, estimate, len(scene.trains), none.CORRECTIONS, law.MESSAGE)
-    extremes = integrate.Extremes.fresh(len(scene.trains), len(own), len(law.WATCHED))
+    extremes = Extremes.fresh(len(scene.trains), len(own), len(law.WATCHED))
     first, length, reference = scene.consists.first, scene.consists.length, scene.reference
     breaks = reference.breaks[1:-1].copy()
 

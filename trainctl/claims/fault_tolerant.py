@@ -17,7 +17,7 @@ from trainctl.plants import actuated_units as plant
 from trainctl.plants import integrate
 from trainctl.plants.faults import Fault, breaks
 from trainctl.scenario.reference import s_curves
-from trainctl.signals import Bounds, Consists, Links, Scene
+from trainctl.signals import Bounds, Consists, Extremes, Links, Scene
 
 CURVES = [
     (60.0, 240.0, 55.0), (400.0, 540.0, 80.0), (700.0, 800.0, 92.0), (1060.0, 1200.0, 65.0),
@@ -96,7 +96,7 @@ class Example:
         own, estimate = s.own.copy(), self.observer.initial(observer_params, s.own)
         air = integrate.Air(np.zeros((2, law.MESSAGE)), self.period is None, True, 0.0)
         work = integrate.scratch(own, estimate, 3, self.observer.CORRECTIONS, law.MESSAGE)
-        self.extremes = integrate.Extremes.fresh(3, 9, 3)
+        self.extremes = Extremes.fresh(3, 9, 3)
         split = np.unique(np.concatenate([breaks(self.faults), s.reference.breaks[1:-1]]))
         sizes = [every, *([self.period] if self.period else []), *([NOISY.noise_hold_s] if self.seed is not None else [])]
         chunk, h = min(sizes), s.sub_step

@@ -17,7 +17,7 @@ from trainctl.controllers import robust_constrained as law
 from trainctl.controllers import robust_gain, robust_theory
 from trainctl.plants import disturbance, point
 from trainctl.scenario.reference import constant
-from trainctl.signals import POSITION, SPEED, Bounds, Consists, Floats, Links, Scene, Trains
+from trainctl.signals import POSITION, SPEED, Bounds, Consists, Disturbed, Floats, Links, Scene, Trains
 
 T, V0, SPACING, N = 0.8, 80.0, 8000.0, 4
 START = np.array([27000.0, 18500.0, 7500.0, 0.0])
@@ -80,7 +80,7 @@ def scene(
     )  # fmt: skip
 
 
-Kicks = Callable[[int, Floats], disturbance.Disturbed | None]
+Kicks = Callable[[int, Floats], Disturbed | None]
 
 
 def quiet(k: int, position: Floats) -> None:
@@ -88,7 +88,7 @@ def quiet(k: int, position: Floats) -> None:
     return None
 
 
-def printed(k: int, position: Floats) -> disturbance.Disturbed:
+def printed(k: int, position: Floats) -> Disturbed:
     """The printed disturbances, constant."""
     return disturbance.at(SIGNALS, k, k * T, position)
 

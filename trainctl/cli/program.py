@@ -104,7 +104,7 @@ def _summary(done: Run, prepared: Prepared) -> None:
         table.add_row(line.title, f"FAILED: {line.text}" if line.failed else line.text)
     table.add_row("results", f"{done.folder}/  (trainctl plot {done.folder}; trainctl metrics {done.folder})")
     show(table)
-    for note in () if prepared.roster is None else prepared.roster.notes:
+    for note in prepared.roster.notes:
         print(f"warning: {note}")
 
 

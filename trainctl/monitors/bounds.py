@@ -9,26 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from trainctl.monitors import on_track, waiting
-from trainctl.monitors.energy import Balance
+from trainctl.monitors import energy, on_track, waiting
 from trainctl.monitors.on_track import ROUNDING
 from trainctl.monitors.outcome import Tally
 from trainctl.monitors.waiting import Wait, Waiting
 from trainctl.signals import Floats, Ints
 
 if TYPE_CHECKING:
-    from trainctl.railway.authority import View
-    from trainctl.railway.interlocking import Held
     from trainctl.railway.ways import Ways
     from trainctl.scenario.build import Prepared
-    from trainctl.stages.convoys import Service
-    from trainctl.stages.record import Row
-    from trainctl.world import Seen
+    from trainctl.signals import Row, Seen
+    from trainctl.stages.traffic import Around
+    from trainctl.stages.traffic import State as Traffic
 
 Alarm = dict[str, Any]
 
@@ -37,45 +33,50 @@ def _alarm(bound: str, who: str, value: float, limit: float) -> Alarm:
     return {"bound": bound, "who": who, "value": value, "limit": limit}
 
 
-class Alarms:
-    """What has been broken so far, and how often (steps).
+class State(NamedTuple):
+    """What has been broken so far, and what that is told from; overwritten in place."""
 
-    Attributes
-    ----------
-    tally : Tally
-        What was broken, how often, and the worst of it.
-    watch : Watch
-        Trains inside one another, and too fast for their line.
-    waiting : Waiting
-        Who waits for whom.
-    """
+    tally: Tally
+    last: Floats  # (n,) m, fronts a step ago, see ``on_track``
+    waiting: waiting.State
+    during: Floats  # (lower and upper, n, q) bounds of constrained quantities in the interval the extremes are of
+    now: Floats  # ... under the present links
+    energy: energy.State | tuple[()]
+
+
+class Alarms:
+    """Tells what is broken for the first time. Its methods update the ``State`` they are given."""
 
     def __init__(self, p: Prepared) -> None:
-        n = len(p.scenario.train)
         self.p = p
-        self.tally = Tally()
         self.watch = on_track.of(p)
         self.waiting = Waiting(p.scenario.ids, p.line.edges, p.driving.wait_limit_s)
         units = p.scenario.plant.kind != "point"
         self.watched: tuple[str, ...] = tuple(getattr(p.law, "WATCHED", ())) if units and not p.sampled else ()
-        # (lower and upper, n, q): of the interval the extremes are of, and of the present links
+        self.energy = energy.Balance(p) if units else None
+
+    def initial(self) -> State:
+        """Nothing broken yet."""
+        n = len(self.p.scenario.train)
         free = np.stack([np.full((n, len(self.watched)), -np.inf), np.full((n, len(self.watched)), np.inf)])
-        self.during, self.now = free, free.copy()
-        self.energy = Balance(p) if units else None
+        return State(
+            Tally.empty(), self.watch.initial(), self.waiting.initial(), free, free.copy(),
+            self.energy.initial() if self.energy else (),
+        )  # fmt: skip
 
-    def new(self, row: Row, ways: Ways, here: Seen) -> Iterator[Alarm]:
+    def new(self, row: Row, ways: Ways, here: Seen, s: State) -> Iterator[Alarm]:
         """What is broken in this row for the first time, as fields of an event; ``here`` is where the world has the trains."""
-        for alarm in chain(self._all(row), self.watch.broken(ways, here, row.speed)):
-            yield from self.tally.once(row.time, **alarm)
+        for alarm in chain(self._all(row, s), self.watch.broken(ways, here, row.speed, s.last)):
+            yield from s.tally.once(row.time, **alarm)
 
-    def counted(self, end: float, collisions: Sequence[Mapping[str, Any]]) -> Iterator[tuple[float, Alarm]]:
+    def counted(self, end: float, collisions: Sequence[Mapping[str, Any]], s: State) -> Iterator[tuple[float, Alarm]]:
         """Time [s] and fields of events for the collisions of ``World.collisions`` that were not told before."""
         for found in collisions:
             at = end if found["time_s"] is None else found["time_s"]
-            for alarm in self.tally.counted(at, found):
+            for alarm in s.tally.counted(at, found):
                 yield at, alarm
 
-    def relinked(self, time: float, groups: Sequence[Sequence[int]], formation: Ints, scene: Any) -> Iterator[Alarm]:
+    def relinked(self, time: float, groups: Sequence[Sequence[int]], formation: Ints, scene: Any, s: State) -> Iterator[Alarm]:
         """Take over the law's bounds on new links; a formation that is in pieces is told.
 
         Parameters
@@ -88,13 +89,15 @@ class Alarms:
             The formation every train belongs to.
         scene : Scene
             For the law's ``watched_bounds``.
+        s : State
+            Updated.
         """
         bounds = getattr(self.p.law, "watched_bounds", None)
         if self.watched and bounds is not None:
-            self.now = np.stack(bounds(self.p.params, scene))
-            if self.p.roster is not None:
+            s.now[:] = np.stack(bounds(self.p.params, scene))
+            if not self.p.placed:
                 alone = np.bincount(scene.links.receiver, minlength=len(formation)) == 0
-                self.now[0, alone], self.now[1, alone] = -np.inf, np.inf
+                s.now[0, alone], s.now[1, alone] = -np.inf, np.inf
         piece = np.empty(len(formation), np.int64)
         for k, group in enumerate(groups):
             piece[list(group)] = k
@@ -102,11 +105,10 @@ class Alarms:
         pairs = np.unique(np.stack([whole, piece]), axis=1)[0]
         for key in np.unique(pairs[1:][pairs[1:] == pairs[:-1]]).tolist():
             who = ",".join(self.p.scenario.ids[i] for i in np.flatnonzero(whole == key))
-            yield from self.tally.once(time, bound="connected_pieces", who=who, value=float((pairs == key).sum()), limit=1.0)
+            yield from s.tally.once(time, bound="connected_pieces", who=who, value=float((pairs == key).sum()), limit=1.0)
 
-    def _all(self, row: Row) -> Iterator[Alarm]:
-        ids, bounds, speed = self.p.scenario.ids, self.p.bounds, row.speed
-        led = True if row.led is None else row.led
+    def _all(self, row: Row, s: State) -> Iterator[Alarm]:
+        ids, bounds, speed, led = self.p.scenario.ids, self.p.bounds, row.speed, row.led
         yield from self._per_train("speed_lower_mps", speed, bounds.speed_lower, led & (speed < bounds.speed_lower - ROUNDING))
         yield from self._per_train("speed_upper_mps", speed, bounds.speed_upper, led & (speed > bounds.speed_upper + ROUNDING))
         if row.motion is not None:
@@ -114,8 +116,8 @@ class Alarms:
             yield from self._per_train("input_lower_mps2", u, bounds.input_lower, led & (u < bounds.input_lower - ROUNDING))
             yield from self._per_train("input_upper_mps2", u, bounds.input_upper, led & (u > bounds.input_upper + ROUNDING))
         yield from self._couplers(row)
-        yield from self._constrained(row)
-        yield from self._energies(row)
+        yield from self._constrained(row, s)
+        yield from self._energies(row, s)
         links = row.links
         spacing = row.seen.position[links.sender] - row.seen.position[links.receiver]
         ahead = spacing > 0.0  # each pair once
@@ -139,17 +141,17 @@ class Alarms:
                 i = int(np.searchsorted(p.consists.first, u, side="right")) - 1
                 yield _alarm(key, f"{p.scenario.ids[i]}.{u - p.consists.first[i] + 1}", float(value[u]), bound)
 
-    def _constrained(self, row: Row) -> Iterator[Alarm]:
+    def _constrained(self, row: Row, s: State) -> Iterator[Alarm]:
         """The law's own constrained quantities in any sub-step since the last row, against the bounds that held then."""
         x = row.extremes
         if not self.watched:
             return
         if x is None:  # not recorded: extremes go on, perhaps under new links, so the wider bounds serve
-            lower, upper = np.minimum(self.during[0], self.now[0]), np.maximum(self.during[1], self.now[1])
-            self.during = np.stack([lower, upper])
+            np.minimum(s.during[0], s.now[0], out=s.during[0])
+            np.maximum(s.during[1], s.now[1], out=s.during[1])
             return
-        low, high = self.during
-        self.during = self.now
+        low, high = s.during.copy()
+        s.during[:] = s.now
         seen = x.watched_min <= x.watched_max
         for side, value, bound, broken in (
             ("lower", x.watched_min, low, seen & (x.watched_min < low - ROUNDING)),
@@ -159,52 +161,36 @@ class Alarms:
                 stem, _, unit = self.watched[q].rpartition("_")
                 yield _alarm(f"{stem}_{side}_{unit}", self.p.scenario.ids[i], float(value[i, q]), float(bound[i, q]))
 
-    def _energies(self, row: Row) -> Iterator[Alarm]:
+    def _energies(self, row: Row, s: State) -> Iterator[Alarm]:
         """Trains whose energy changes by something else than what is accounted for."""
         if self.energy is None:
             return
-        for i, share in self.energy.broken(row):
+        assert isinstance(s.energy, energy.State)
+        for i, share in self.energy.broken(row, s.energy):
             yield _alarm("energy_balance_share", self.p.scenario.ids[i], share, self.energy.LIMIT)
 
     def waits(
-        self, t: float, here: Seen, speed: Floats, view: View, held: Held, service: Service | None, out: Mapping[int, int]
+        self, t: float, here: Seen, speed: Floats, traffic: Traffic, around: Around, due: Sequence[int], s: State
     ) -> Iterator[tuple[str, Alarm]]:
-        """Long waits and circles, as kind and fields of events; arguments as of ``waiting.waits`` and ``waiting.entries``."""
-        p, found, due = self.p, list[Wait](), dict[int, float]()
-        rules = p.supervision if service is None else service.rules
-        own_stop = np.zeros(len(speed), bool) if service is None else service.standing
-        if service is not None or rules.mode == "on":  # otherwise nothing keeps a train from going on
-            assumed = p.assumed if service is None else service.assumed
-            found = waiting.waits(view, held, here, speed, rules, assumed, p.scenario.run.step_s, p.step_theta, own_stop)
-        if service is not None:
-            entries = waiting.entries(service, t, held, out)
-            due = {w.train: float(service.roster.depart[w.train]) for w in entries}
-            found += entries
-        yield from self.waiting.new(t, found, due)
+        """Long waits and circles, as kind and fields of events; ``due`` are the trains that are to come now, one on each edge."""
+        p, found, since = self.p, list[Wait](), dict[int, float]()
+        if around.view is None or around.held is None:
+            return
+        rules, assumed = (p.supervision, p.assumed) if p.placed else (p.driver_rules, p.relied_on_by_driver)
+        if rules.mode == "on":  # otherwise nothing keeps a train from going on
+            found = waiting.waits(
+                around.view, around.held, here, speed, rules, assumed, p.scenario.run.step_s, p.step_theta, traffic.standing
+            )
+        entries = waiting.entries(p.roster, traffic.came, due, t, around.held, around.kept_out)
+        since = {w.train: float(p.roster.depart[w.train]) for w in entries}
+        yield from self.waiting.new(t, found + entries, since, s.waiting)
 
-    def outcome(self, not_entered: int) -> dict[str, Any]:
+    def outcome(self, not_entered: int, s: State) -> dict[str, Any]:
         """What run.json says of a finished run; ``not_entered`` trains were due and never came."""
-        more = {"gridlocks": len(self.waiting.circles), "waited_long": self.waiting.long, "not_entered": not_entered}
-        return self.tally.outcome(self.p.supervision.mode == "on", more)
+        counted = s.waiting.counted
+        more = {"gridlocks": len(counted["circles"]), "waited_long": counted["long"], "not_entered": not_entered}
+        return s.tally.outcome(self.p.supervision.mode == "on", more)
 
     def _per_train(self, key: str, value: Floats, bound: Floats, broken: Any) -> Iterator[Alarm]:
         for i in np.flatnonzero(broken).tolist():
             yield _alarm(key, self.p.scenario.ids[i], float(value[i]), float(bound[i]))
-
-    def values(self) -> dict[str, Any]:
-        """What it remembers, as plain JSON; the rest is in ``arrays``."""
-        return {"tally": self.tally.values(), "waiting": self.waiting.values()}
-
-    def arrays(self) -> tuple[NDArray[Any], ...]:
-        """Arrays it remembers."""
-        return (
-            self.watch.last, self.during, self.now, *self.waiting.arrays(), *(self.energy.arrays() if self.energy else ()),
-        )  # fmt: skip
-
-    def restore(self, values: dict[str, Any], arrays: Sequence[NDArray[Any]]) -> None:
-        """Remember what ``values`` and ``arrays`` told."""
-        self.tally.restore(values["tally"])
-        self.watch.last, self.during, self.now = (a.copy() for a in arrays[:3])
-        self.waiting.restore(values["waiting"], arrays[3:5])
-        if self.energy is not None:
-            self.energy.restore(arrays[5:])

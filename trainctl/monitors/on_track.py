@@ -19,7 +19,7 @@ from trainctl.signals import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from trainctl.scenario.build import Prepared
-    from trainctl.world import Seen
+    from trainctl.signals import Seen
 
 keep_by_sources()  # before anything below is decorated
 
@@ -91,23 +91,23 @@ def limits(track: Track, ways: Ways, row: Ints, s: Floats, length: Floats, prese
 
 
 class Watch:
-    """Overlaps and overspeeds from step to step.
-
-    Attributes
-    ----------
-    last : ndarray, shape (n,)
-        Front of every train a step ago [m]; NaN where it was not there.
-    """
+    """Overlaps and overspeeds from step to step."""
 
     def __init__(self, ids: Sequence[str], length: Floats, factor: Floats, rails: Rails, line: Line, net: bool) -> None:
         self.ids, self.length, self.factor, self.line, self.net = ids, length, factor, line, net
         self.track = track(rails, None if net else line.tracks)
-        self.last = np.full(len(length), np.nan)
 
-    def broken(self, ways: Ways, seen: Seen, speed: Floats) -> Iterator[dict[str, Any]]:
-        """What is wrong now, as fields of an event; ``seen`` counts as the ways do, ``speed`` (n,) [m/s]."""
-        moved = seen.position - self.last
-        self.last = np.where(seen.present, seen.position, np.nan)
+    def initial(self) -> Floats:
+        """Front of every train a step ago [m], shape (n,); NaN where it was not there."""
+        return np.full(len(self.length), np.nan)
+
+    def broken(self, ways: Ways, seen: Seen, speed: Floats, last: Floats) -> Iterator[dict[str, Any]]:
+        """What is wrong now, as fields of an event; ``seen`` counts as the ways do, ``speed`` (n,) [m/s].
+
+        ``last`` (n,), where the fronts were a step ago, is overwritten in place.
+        """
+        moved = seen.position - last
+        last[:] = np.where(seen.present, seen.position, np.nan)
         found = overlaps(self.track, ways, seen.row, seen.position, self.length, seen.present, moved)
         for a, b, depth, edge, place in zip(*(part.tolist() for part in found), strict=True):
             trains = [self.ids[a], self.ids[b]]
@@ -126,8 +126,7 @@ class Watch:
 
 def of(p: Prepared, line: Line | None = None) -> Watch:
     """The watch over the trains of a scenario; ``line`` where they run on another one than the scenario's."""
-    net = p.roster is not None
-    factor = np.ones(len(p.scenario.ids)) if p.roster is None else p.roster.speed_factor
+    net, factor = not p.placed, p.roster.speed_factor
     rails = Rails.of(line) if line is not None and not net else p.rails
     return Watch(p.scenario.ids, p.consists.train_length(), factor, rails, line or p.line, net)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from trainctl.monitors.on_track import GAP, LIMIT
 
@@ -11,33 +11,25 @@ from trainctl.monitors.on_track import GAP, LIMIT
 COUNTED = "sumo_collision"
 
 
-class Tally:
-    """Bounds broken so far.
+class Tally(NamedTuple):
+    """What was broken so far, in plain JSON; updated in place."""
 
-    Attributes
-    ----------
-    count : dict
-        (bound, who) -> number of steps or rows in which it was broken; of a pair of trains ``who`` has them in order of their ids.
-    first : dict or None
-        The first violation: time [s], bound, who, value, limit.
-    worst : dict
-        Of overlaps and overspeeds the one that went farthest beyond its limit, by bound: time [s], who, value, limit.
-    pairs : list of list of str
-        Trains that collided.
-    """
+    broken: dict[str, dict[str, int]]  # bound -> who -> steps or rows in which it was broken; of a pair in order of its ids
+    first: dict[str, Any]  # the first violation: time [s], bound, who, value, limit; empty: none
+    worst: dict[str, dict[str, Any]]  # by bound, the farthest overlap and overspeed: time [s], who, value, limit
+    pairs: list[list[str]]  # trains that collided
 
-    def __init__(self) -> None:
-        self.count: dict[tuple[str, str], int] = {}
-        self.first: dict[str, Any] | None = None
-        self.worst: dict[str, dict[str, Any]] = {}
-        self.pairs: list[list[str]] = []
+    @classmethod
+    def empty(cls) -> Tally:
+        """Nothing was broken."""
+        return cls({}, {}, {}, [])
 
     def once(self, time: float, bound: str, who: str, value: float, limit: float, **more: Any) -> Iterator[dict[str, Any]]:
         """Count something broken; the first time it is given back, as fields of an event."""
         pair = sorted(more.get("trains", ()))
-        key = bound, "-".join(pair) if pair else who
-        seen = self.count.get(key, 0)
-        self.count[key] = seen + 1
+        counts, name = self.broken.setdefault(bound, {}), "-".join(pair) if pair else who
+        seen = counts.get(name, 0)
+        counts[name] = seen + 1
         told = {"who": who, "value": value, "limit": limit}
         if bound in (GAP, LIMIT):
             known = self.worst.get(bound)
@@ -46,8 +38,8 @@ class Tally:
         if not seen:
             if pair and pair not in self.pairs:
                 self.pairs.append(pair)
-            if self.first is None or time < self.first["time_s"]:
-                self.first = {"time_s": time, "bound": bound, **told}
+            if not self.first or time < self.first["time_s"]:
+                self.first.update({"time_s": time, "bound": bound, **told})
             yield {"bound": bound, **told, **more}
 
     def counted(self, time: float, found: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
@@ -66,22 +58,12 @@ class Tally:
         more : mapping
             Numbers of gridlocks, waits and trains that did not enter.
         """
-        collisions, overspeeds = len(self.pairs), [bound for bound, _ in self.count].count(LIMIT)
+        collisions, overspeeds = len(self.pairs), len(self.broken.get(LIMIT, {}))
         failed = {
             "collision": collisions > 0, "overspeed": overspeeds > 0 and supervised, "gridlock": more.get("gridlocks", 0) > 0,
         }  # fmt: skip
         return {
-            "violations": len(self.count), "first_violation": self.first, "collisions": collisions, "overspeeds": overspeeds,
-            **more, "worst": self.worst, "checks_failed": [name for name, is_so in failed.items() if is_so],
+            "violations": sum(map(len, self.broken.values())), "first_violation": self.first or None, "collisions": collisions,
+            "overspeeds": overspeeds, **more, "worst": self.worst,
+            "checks_failed": [name for name, is_so in failed.items() if is_so],
         }  # fmt: skip
-
-    def values(self) -> dict[str, Any]:
-        """What it remembers, as plain JSON."""
-        count = [[*key, number] for key, number in self.count.items()]
-        return {"count": count, "first": self.first, "worst": self.worst, "pairs": self.pairs}
-
-    def restore(self, values: Mapping[str, Any]) -> None:
-        """Remember what ``values`` told."""
-        self.count = {(bound, who): number for bound, who, number in values["count"]}
-        self.first, self.worst = values["first"], dict(values["worst"])
-        self.pairs = [list(pair) for pair in values["pairs"]]

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from trainctl.railway import authority, supervisor
 from trainctl.signals import Bools, Floats
@@ -19,8 +18,8 @@ from trainctl.signals import Bools, Floats
 if TYPE_CHECKING:
     from trainctl.railway.authority import View
     from trainctl.railway.interlocking import Held
-    from trainctl.stages.convoys import Service
-    from trainctl.world import Seen
+    from trainctl.scenario.roster import Roster
+    from trainctl.signals import Seen
 
 #: Slower than this a train stands [m/s].
 STANDS_MPS = 0.05
@@ -90,11 +89,13 @@ def kept_out(view: View, i: int) -> int:
     return int(t.other[rows[k]] if k < len(ahead) else t.train[rows[k]])
 
 
-def entries(service: Service, t: float, held: Held, out: Mapping[int, int]) -> list[Wait]:
-    """What trains wait for that are due and not on the net; ``out`` says who keeps out those that no switch does."""
-    roster = service.roster
-    late = np.flatnonzero(~service.came & (roster.depart <= t + 1e-9)).tolist()
-    first = {int(roster.edge[i]): i for i in reversed(service.due(t))} if late else {}
+def entries(roster: Roster, came: Bools, due: Sequence[int], t: float, held: Held, out: Mapping[int, int]) -> list[Wait]:
+    """What trains wait for that are to come and have not, of those ``due`` (the first on each edge) and the ones behind them.
+
+    ``out`` says who keeps out those that no switch does.
+    """
+    late = np.flatnonzero(~came & (roster.depart <= t + 1e-9)).tolist()
+    first = {int(roster.edge[i]): i for i in reversed(due)} if late else {}
     found = []
     for i in late:
         edge = int(roster.edge[i])
@@ -130,43 +131,40 @@ def circles(found: Sequence[Wait]) -> list[list[int]]:
     return [[trains[k] for k in one] for one in sorted(alike)]
 
 
-class Waiting:
-    """Waits from step to step: each is told once, a long one and a circle.
+class State(NamedTuple):
+    """Waits told so far; overwritten in place."""
 
-    Attributes
-    ----------
-    since : ndarray, shape (n,)
-        Since when every train waits [s]; NaN: it does not.
-    told : ndarray, shape (n,)
-        Whether that has been told.
-    circles : list of list of int
-        Circles told so far.
-    long : int
-        Long waits told so far.
-    """
+    since: Floats  # (n,) s, since when every train waits, NaN: it does not
+    told: Bools  # (n,) whether that has been told
+    counted: dict[str, Any]  # circles: lists of trains; long: number of long waits
+
+
+class Waiting:
+    """Waits from step to step: each is told once, a long one and a circle."""
 
     def __init__(self, ids: Sequence[str], edges: Sequence[str], limit_s: float) -> None:
         self.ids, self.edges, self.limit_s = ids, edges, limit_s
-        self.since, self.told = np.full(len(ids), np.nan), np.zeros(len(ids), bool)
-        self.circles: list[list[int]] = []
-        self.long = 0
 
-    def new(self, t: float, found: Sequence[Wait], due: Mapping[int, float]) -> Iterator[tuple[str, dict[str, Any]]]:
+    def initial(self) -> State:
+        """Nobody waits yet."""
+        return State(np.full(len(self.ids), np.nan), np.zeros(len(self.ids), bool), {"circles": [], "long": 0})
+
+    def new(self, t: float, found: Sequence[Wait], due: Mapping[int, float], s: State) -> Iterator[tuple[str, dict[str, Any]]]:
         """Events at ``t`` [s], as kind and fields; ``due`` has the time since which trains wait that are to enter [s]."""
         of = {w.train: w for w in reversed(found)}  # where a train waits for two, the first is told
         waits = np.zeros(len(self.ids), bool)
         waits[list(of)] = True
-        self.told &= waits
-        self.since = np.where(waits, np.where(np.isnan(self.since), t, self.since), np.nan)
+        s.told[:] &= waits
+        s.since[:] = np.where(waits, np.where(np.isnan(s.since), t, s.since), np.nan)
         for i, planned in due.items():
-            self.since[i] = planned
-        for i in np.flatnonzero(waits & ~self.told & (t - self.since > self.limit_s)).tolist():
-            self.told[i] = True
-            self.long += 1
-            yield "waiting", {**self._words(of[i]), "since_s": float(self.since[i])}
+            s.since[i] = planned
+        for i in np.flatnonzero(waits & ~s.told & (t - s.since > self.limit_s)).tolist():
+            s.told[i] = True
+            s.counted["long"] += 1
+            yield "waiting", {**self._words(of[i]), "since_s": float(s.since[i])}
         for circle in circles(found):
-            if circle not in self.circles:
-                self.circles.append(circle)
+            if circle not in s.counted["circles"]:
+                s.counted["circles"].append(circle)
                 inside = [w for w in found if w.train in circle and w.other in circle]
                 yield "gridlock", {"trains": [self.ids[i] for i in circle], "waits": [self._words(w) for w in inside]}
 
@@ -177,16 +175,3 @@ class Waiting:
             "edge": self.edges[wait.edge] if wait.edge >= 0 else None,
             "place": wait.place,
         }
-
-    def values(self) -> dict[str, Any]:
-        """What it remembers, as plain JSON; the rest is in ``arrays``."""
-        return {"circles": self.circles, "long": self.long}
-
-    def arrays(self) -> tuple[NDArray[Any], ...]:
-        """Arrays it remembers."""
-        return self.since, self.told
-
-    def restore(self, values: Mapping[str, Any], arrays: Sequence[NDArray[Any]]) -> None:
-        """Remember what ``values`` and ``arrays`` told."""
-        self.circles, self.long = [list(one) for one in values["circles"]], values["long"]
-        self.since, self.told = (a.copy() for a in arrays)

@@ -28,7 +28,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from pydantic.json_schema import SkipJsonSchema
 from pydantic_core import PydanticCustomError
 
-from trainctl.signals import Floats, Ints, Table
+from trainctl.signals import Disturbed, Floats, Ints, Table
 
 #: What a disturbance acts on; the rows of every array of shape (5, n) here.
 CHANNELS = ("position", "speed", "input", "resistance", "measurement")
@@ -203,21 +203,6 @@ class Signals(NamedTuple):
     number: Floats  # (R, 8)
     table: Floats  # the tables of all rows, one after the other
     trains: int  # n
-
-
-class Disturbed(NamedTuple):
-    """What acts in one step, shape (n,)."""
-
-    position: Floats  # w1 [m]
-    speed: Floats  # w2 [m/s]
-    input: Floats  # w3 [m/s2]
-    resistance: Floats  # true over believed resistance, 1 if undisturbed
-    measurement: Floats  # measured minus true position [m]
-
-    def calm(self) -> Disturbed:
-        """The same step without what disturbs the motion: what can be known of it before."""
-        none = np.zeros_like(self.position)
-        return Disturbed(none, none, none, np.ones_like(none), self.measurement)
 
 
 # Columns of Signals.whole. The steps of a row count from BEGIN, its table is table[START:END]; the rest are words of the generator.

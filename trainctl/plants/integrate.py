@@ -23,7 +23,7 @@ from numba.extending import overload
 from trainctl.errors import LawError
 from trainctl.kernels import bare
 from trainctl.plants import shared
-from trainctl.signals import FORCE, POSITION, POWERS, SPEED, Floats, Ints, Links, Reference, leader_at
+from trainctl.signals import FORCE, POSITION, POWERS, SPEED, Extremes, Floats, Ints, Links, Reference, leader_at
 
 types: Any = numba.types
 typeof: Any = numba.typeof
@@ -76,29 +76,6 @@ class Air(NamedTuple):
     live: bool  # True: neighbours' data are those of this very instant (the papers); False: ``heard`` is held
     chain: bool  # a message depends on its sender's demand: front to rear, message after demand
     sent_at: float  # s, when ``heard`` was sent, if held
-
-
-class Extremes(NamedTuple):
-    """Over the sub-steps since they were last reset: a once-a-second sample hides peaks."""
-
-    coupler_min: Floats  # (U,) m
-    coupler_max: Floats
-    force_min: Floats  # (U,) N
-    force_max: Floats
-    watched_min: Floats  # (n, q) the law's constrained quantities
-    watched_max: Floats
-    limited: Floats  # (n,) s, time during which a unit limit acted
-    energy: Floats  # (n, 6) J, see signals.POWERS
-    watched: Floats  # (n, q) the constrained quantities when last seen
-
-    @classmethod
-    def fresh(cls, trains: int, units: int, watched: int) -> Extremes:
-        """Nothing seen yet."""
-        low, high = np.full(units, np.inf), np.full(units, -np.inf)
-        return cls(
-            low, high, low.copy(), high.copy(), np.full((trains, watched), np.inf), np.full((trains, watched), -np.inf),
-            np.zeros(trains), np.zeros((trains, len(POWERS))), np.full((trains, watched), np.nan),
-        )  # fmt: skip
 
 
 class Scratch(NamedTuple):

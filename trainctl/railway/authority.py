@@ -17,6 +17,10 @@ from trainctl.signals import Bools, Floats, Ints
 keep_by_sources()  # before anything below is decorated
 
 
+#: What the driver keeps clear beyond the supervisor's margin, so that the latter has nothing to do [m].
+DRIVER_MARGIN_M = 10.0
+
+
 class View(NamedTuple):
     """What is ahead of every train now."""
 

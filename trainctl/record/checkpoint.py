@@ -32,16 +32,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trainctl.errors import InputError, SimulatorError
-from trainctl.plants.integrate import Extremes
 from trainctl.railway.ways import Ways
 from trainctl.record.folder import FORMAT, installed
 from trainctl.scenario.build import Prepared
-from trainctl.signals import Demand, Floats, Ints, Links
-from trainctl.stages.plant import Units
-from trainctl.world import Seen, Start, World
+from trainctl.signals import Floats, Ints, Links, Seen, Start
+from trainctl.world import World
 
 if TYPE_CHECKING:
-    from trainctl.loop import Simulation
+    from trainctl.loop import Loop
 
 FOLDER = "checkpoint"
 START, MOVES, STATE, DONE, RESERVE = "start.json", "moves.bin", "state.npz", "done.json", "reserve"
@@ -59,6 +57,9 @@ RESERVE_BYTES = 1 << 16
 PIECE = 1 << 20
 
 Arrays = Mapping[str, NDArray[Any]]
+
+#: The shape of ``Formed.made_of``: time, own state and links.
+MADE_OF: Any = (0.0, np.zeros(0), Links(*[np.zeros(0)] * len(Links._fields)))  # type: ignore[arg-type]
 
 
 class Saved(NamedTuple):
@@ -190,28 +191,22 @@ def _by_step(told: list[Any]) -> dict[int, list[Any]]:
     return found
 
 
-class Unheard:
-    """Where a simulation that starts once more tells what was told before."""
-
-    def event(self, time: float, kind: str, **fields: Any) -> None:
-        """Nobody writes it down."""
-
-
-def write(folder: Path, simulation: Simulation, more: Mapping[str, Any]) -> None:
+def write(folder: Path, loop: Loop, more: Mapping[str, Any]) -> None:
     """Replace the checkpoint in ``folder`` by the state between two steps.
 
     Parameters
     ----------
     folder : Path
         ``DIR.partial/checkpoint``.
-    simulation : Simulation
+    loop : Loop
         Between two steps.
     more : mapping
         Further plain JSON: ``identity``, what ``Recorder.cut`` and ``Tape.save`` returned.
     """
-    values, whole = state(simulation)
+    whole = {"state": loop.state, "made_of": loop.state.formed.made_of, "seen": loop.world.measure()}
     arrays = {name: array for part, value in whole.items() for name, array in leaves(part, value)}
-    text = json.dumps({**values, **more}).encode()
+    values = dict(pair for part in ("state", "made_of") for pair in plain(part, whole[part]))
+    text = json.dumps({"state": values, **more}).encode()
     packed = io.BytesIO()
     np.savez(packed, allow_pickle=False, **arrays, json=np.frombuffer(text, np.uint8))
     replace(folder / STATE, packed.getvalue())
@@ -297,79 +292,46 @@ def leaves(name: str, value: Any) -> Iterator[tuple[str, NDArray[Any]]]:
             yield from leaves(f"{name}.{k}", part)
 
 
-def state(simulation: Simulation) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Everything that changes while a run goes on: plain values, and (named) tuples of arrays."""
-    s, motion = simulation, simulation.motion
-    assert s.relinked is not None
-    t, own, links = s.relinked
-    seen = s.world.measure()
-    values: dict[str, Any] = {
-        "k": s.k, "pending": [number for number, _ in s.reroutes.pending], "relinked_s": t, "sent": len(s.exchange.sent),
-        "alarms": s.alarms.values(),
-    }  # fmt: skip
-    arrays: dict[str, Any] = {
-        "own": s.own, "track": s.track, "formation": s.formation, "ahead": s.ahead, "links": s.links, "demand": s.demand,
-        "relinked_own": own, "relinked_links": links, "constants": s.constants, "alarms": s.alarms.arrays(),
-        "sent": tuple(s.exchange.sent), "heard": s.exchange.heard, "ever": s.exchange.ever, "outside": s.outside, "seen": seen,
-        "acting": s.supervision.acting,
-    }  # fmt: skip
-    if s.lookout is not None:
-        values |= {"claims": s.lookout.claims}
-        arrays |= {"waits_for": s.lookout.waits_for}
-    if s.service is not None:
-        arrays |= {"service": s.service.state()}
-    if isinstance(motion, Units):
-        values |= {"counted": motion.counted, "sent_at": motion.air.sent_at}
-        arrays |= {
-            "estimate": motion.estimate, "extremes": motion.extremes, "work": motion.work, "air": motion.air.heard,
-            "loop": motion.loop,
-        }  # fmt: skip
-    return values, arrays
+def plain(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """What of (named) tuples is no array: numbers, words, tables and lists, under their places; lengths of plain tuples."""
+    if isinstance(value, tuple):
+        if not hasattr(value, "_fields"):
+            yield f"{name}.length", len(value)
+        for k, part in enumerate(value):
+            yield from plain(f"{name}.{k}", part)
+    elif value is None or isinstance(value, bool | int | float | str | dict | list):
+        yield name, value
 
 
-def restore(simulation: Simulation, tape: Tape, saved: Saved) -> None:
-    """Bring a simulation that has just started, and its world, to where the checkpoint was made."""
-    s, values, arrays = simulation, saved.values, saved.arrays
-    tape.replay(s.p.scenario.run.step_s)
-    seen = s.world.measure()
-    if not (np.array_equal(seen.position, arrays["seen.0"]) and np.array_equal(seen.edge, arrays["seen.1"])):
+def again(name: str, value: Any, arrays: Arrays, values: Mapping[str, Any]) -> Any:
+    """``value`` with its leaves as they were saved; what is neither an array nor plain stays."""
+    if isinstance(value, np.ndarray):
+        if name not in arrays:
+            raise InputError(f"checkpoint: {name} is missing; run it again with `trainctl run`")
+        return arrays[name].copy()
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return type(value)(*(again(f"{name}.{k}", part, arrays, values) for k, part in enumerate(value)))
+    if isinstance(value, tuple):
+        length = values[f"{name}.length"]
+        known = f"{name}.0" in values  # numbers, or arrays
+        parts = [*value, *([0 if known else np.zeros(0)] * (length - len(value)))][:length]
+        return tuple(again(f"{name}.{k}", part, arrays, values) for k, part in enumerate(parts))
+    return values.get(name, value)
+
+
+def restore(loop: Loop, tape: Tape, saved: Saved) -> None:
+    """Bring a loop that has just started, and its world, to where the checkpoint was made."""
+    tape.replay(loop.p.scenario.run.step_s)
+    seen = loop.world.measure()
+    if not (np.array_equal(seen.position, saved.arrays["seen.0"]) and np.array_equal(seen.edge, saved.arrays["seen.1"])):
         raise SimulatorError("the simulator did not come back to where it was: other versions or another network")
-
-    def taken(kind: Any, part: str) -> Any:
-        return kind(*(arrays[f"{part}.{k}"].copy() for k in range(len(kind._fields))))
-
-    s.k, s.own, s.track, s.formation = values["k"], arrays["own"].copy(), arrays["track"].copy(), arrays["formation"].copy()
-    s.reroutes.pending = [one for one in s.reroutes.pending if one[0] in values["pending"]]
-    s.links, s.ahead, s.demand = taken(Links, "links"), arrays["ahead"].copy(), taken(Demand, "demand")
-    relinked = values["relinked_s"], arrays["relinked_own"].copy(), taken(Links, "relinked_links")
-    s.relinked = relinked
-    scene = s.p.scene(relinked[1], relinked[2], relinked[0])
-    s.constants = s.p.law.constants(s.p.params, scene)
-    refill("constants", s.constants, arrays)
-    s.alarms.restore(values["alarms"], [arrays[f"alarms.{k}"] for k in range(len(s.alarms.arrays()))])
-    s.outside, s.supervision.acting = arrays["outside"].copy(), arrays["acting"].copy()
-    if s.lookout is not None:
-        s.lookout.claims, s.lookout.waits_for = values["claims"], arrays["waits_for"].copy()
-    if s.service is not None:
-        refill("service", s.service.state(), arrays)
-    s.exchange.heard, s.exchange.ever = arrays["heard"].copy(), arrays["ever"].copy()
-    s.exchange.sent.extend(arrays[f"sent.{k}"].copy() for k in range(values["sent"]))
-    motion = s.motion
-    if isinstance(motion, Units):
-        motion.estimate = arrays["estimate"].copy()
-        motion.relink(scene, s.constants)
-        motion.extremes, motion.counted = taken(Extremes, "extremes"), values["counted"]
-        motion.air = motion.air._replace(heard=arrays["air"].copy(), sent_at=float(values["sent_at"]))
-        refill("work", motion.work, arrays)
-        refill("loop", motion.loop, arrays)
-    s.world.linked(s.links, s.formation)
-
-
-def refill(name: str, value: Any, arrays: Arrays) -> None:
-    """Overwrite all arrays in a tuple of tuples with the saved ones: laws and plants may keep state in their constants."""
-    for place, array in leaves(name, value):
-        saved = arrays.get(place)
-        if saved is None or saved.shape != array.shape:
-            raise InputError(f"checkpoint: {place} is missing or of another shape; run it again with `trainctl run`")
-        if array.flags.writeable:
-            array[...] = saved
+    values = saved.values["state"]
+    # What law and plant made of the last change of topology has shapes and parts of its own: made again, then filled.
+    made = again("made_of", MADE_OF, saved.arrays, values)
+    scene = loop.p.scene(made[1], made[2], made[0])
+    formed = loop.state.formed._replace(links=made[2], made_of=made, constants=loop.p.law.constants(loop.p.params, scene))
+    memory = loop.p.law.initial(loop.p.params, scene) if loop.p.remembers else ()
+    units = loop.plant.relinked(scene, formed.constants, loop.state.plant)
+    loop.state = again("state", loop.state._replace(formed=formed, memory=memory, plant=units), saved.arrays, values)
+    assert loop.state.formed.links is not None
+    loop.world.linked(loop.state.formed.links, loop.state.formed.formation)

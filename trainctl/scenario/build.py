@@ -20,12 +20,14 @@ from trainctl.errors import InputError
 from trainctl.laws import find_law, find_observer
 from trainctl.plants import actuated_units, disturbance, point, shared
 from trainctl.railway import supervisor
+from trainctl.railway.authority import DRIVER_MARGIN_M
 from trainctl.scenario import placing, promise, roster
 from trainctl.scenario.reading import examine, mistakes, read
 from trainctl.scenario.reference import Profile
 from trainctl.scenario.tables import Scenario, Traffic
-from trainctl.signals import FORCE, POSITION, SPEED, Bounds, Consists, Floats, Ints, Links, Reference, Scene, leader_at
-from trainctl.topology import graph
+from trainctl.signals import FORCE, POSITION, SPEED, Bounds, Consists, Floats, Ints, Links, Reference, Scene, leader_at, restrict
+from trainctl.topology import convoys, graph
+from trainctl.topology.exchange import Radio
 
 
 @dataclass(frozen=True)
@@ -49,12 +51,18 @@ class Prepared:
     line: Any  # Line; None only while mistakes are still being gathered
     spec: Any
     net: Path | None
-    roster: roster.Roster | None = None  # trains that come and go, with network.sumocfg
+    roster: Any  # Roster; None like the line
 
-    @cached_property
+    @property
     def rails(self) -> Rails:
         """The net as a graph, its edges numbered as those of the line."""
-        return Rails.of(self.line) if self.roster is None else self.roster.rails
+        rails: Rails = self.roster.rails
+        return rails
+
+    @property
+    def placed(self) -> bool:
+        """Whether [[train]] tables place the trains: those on one track are a formation with slots. Others come and go."""
+        return self.scenario.network.sumocfg is None
 
     @cached_property
     def supervision(self) -> supervisor.Params:
@@ -66,7 +74,7 @@ class Prepared:
         """
         stated = self.scenario.supervisor or supervisor.Params()
         known: dict[str, Any] = {}
-        if "mode" not in stated.model_fields_set and self.roster is not None:
+        if "mode" not in stated.model_fields_set and not self.placed:
             known["mode"] = "on"
         if "greatest_mps2" not in stated.model_fields_set:
             pulls = self.bounds.input_upper
@@ -126,6 +134,53 @@ class Prepared:
     def driving(self) -> Traffic:
         """How trains that come and go are driven."""
         return self.scenario.traffic or Traffic()
+
+    @cached_property
+    def driver_rules(self) -> supervisor.Params:
+        """By what a driver judges: he brakes as planned and keeps farther away, so that the supervisor has nothing to do."""
+        rules = self.supervision
+        rate = min(self.driving.deceleration_mps2, rules.emergency_mps2)
+        return rules.model_copy(update={
+            "mode": "on", "emergency_mps2": rate, "service_mps2": rate, "greatest_mps2": self.driving.acceleration_mps2,
+            "margin_m": rules.margin_m + DRIVER_MARGIN_M, "emergency_distance_m": 0.0,
+        })  # fmt: skip
+
+    @cached_property
+    def relied_on_by_driver(self) -> supervisor.Assumed:
+        """What a driver relies on of every train."""
+        return promise.planned(self.assumed, self.driver_rules.emergency_mps2)
+
+    @property
+    def radio(self) -> Radio:
+        """How messages travel."""
+        run, top = self.scenario.run, self.scenario.topology
+        period = top.communication_period_s or run.control_period_s or run.step_s
+        return Radio(top.loss, round(top.delay_s / period), top.range_m or np.inf, run.seed or 0)
+
+    @property
+    def spacing(self) -> convoys.Spacing:
+        """What every link of a convoy has."""
+        top = self.scenario.topology
+        return convoys.Spacing(
+            float(top.spacing_m or 0.0), -np.inf if top.lower_m is None else top.lower_m,
+            np.inf if top.upper_m is None else top.upper_m, top.weight,
+        )  # fmt: skip
+
+    @cached_property
+    def cruise(self) -> Floats:
+        """Speed every driver would like to keep [m/s], shape (n,)."""
+        found: Floats = np.minimum(float(self.scenario.reference.speed_mps or 0.0), self.roster.top_speed)
+        return found
+
+    @cached_property
+    def band(self) -> tuple[float, float]:
+        """Least and greatest speed of a convoy's reference that the law takes [m/s]; infinite where there are no convoys."""
+        return speed_band(self) if not self.placed and self.roster.cooperates.sum() > 1 else (-math.inf, math.inf)
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the sampled law keeps a state of its own from one control instant to the next."""
+        return self.sampled and hasattr(self.law, "initial")
 
     @cached_property
     def start_track(self) -> Ints:
@@ -225,8 +280,8 @@ def prepare(
     else:
         network = attempt(_network, scenario, folder)
     plan = attempt(_plan, scenario)
-    if network is not None and trains is None:
-        found += placing.on_the_line(scenario, network[0])
+    misplaced = placing.on_the_line(scenario, network[0]) if network is not None and trains is None else []
+    found += misplaced
     if any(part is None for part in (law, params, observer, observer_params, plant_params, plan)):
         raise InputError([f"{file}: {line}" for line in found])
 
@@ -245,7 +300,7 @@ def prepare(
     prepared = Prepared(
         scenario=_resolved(scenario, bounds), file=file, law=law, params=params, plant=plant, plant_params=plant_params,
         observer=observer, observer_params=observer_params, consists=consists, own=own, bounds=bounds, reference=reference,
-        plan=plan, first_links=first, line=None, spec=None, net=None,
+        plan=plan, first_links=first, line=None, spec=None, net=None, roster=None,
     )  # fmt: skip
     unfit = _fits(prepared)
     found += unfit or [
@@ -266,8 +321,10 @@ def prepare(
         elif law.CLOCK != "none":  # such trains leave at the line's end
             found += placing.long_enough(prepared)
         found += placing.steep(prepared)
-        weak = _can_brake(prepared)
-        found += weak or promise.refusals(prepared)
+        if trains is None and not misplaced:
+            prepared = replace(prepared, roster=roster.placed(scenario, network[0]))
+        if prepared.roster is not None:
+            found += _can_brake(prepared) or promise.refusals(prepared)
     if found:
         # What follows from a key that is wrong already is not a mistake of its own.
         wrong = [line.partition(" = ")[0].partition(":")[0].rpartition(".")[2] for line in known]
@@ -500,3 +557,39 @@ def _connected(p: Prepared) -> list[str]:
         named = " | ".join(", ".join(p.scenario.ids[i] for i in g) for g in groups)
         return [f"topology: the graph of the [[link]] tables is not connected: {named}"]
     return []
+
+
+#: How exactly the band is found [m/s].
+BAND_MPS = 0.05
+
+
+def speed_band(p: Prepared) -> tuple[float, float]:
+    """Least and greatest speed of a reference with which the law takes one train of each kind as a formation [m/s]."""
+    spacing = p.spacing
+    cruise = float(p.scenario.reference.speed_mps or 0.0)
+    kinds = np.unique([t.type for t in p.scenario.train], return_index=True)[1]
+    others = np.setdiff1d(np.arange(len(p.scenario.train)), kinds)
+    members = np.sort(np.concatenate([kinds, others[: max(2 - len(kinds), 0)]]))
+    ahead: Ints = np.full(len(p.scenario.train), -1)
+    ahead[members[1:]] = members[:-1]
+    order = convoys.front_to_rear(ahead)
+    slot = convoys.slots(ahead, order, spacing.desired, np.zeros(len(ahead)))
+    links = convoys.links(ahead, order, slot, spacing)
+    units, own = np.diff(p.consists.first), p.own.copy()
+    own[:, POSITION] += np.repeat(slot - own[p.heads, POSITION], units)
+
+    def takes(v: float) -> bool:
+        own[:, SPEED] = v
+        scene = p.scene(own, links, 0.0)._replace(reference=Reference(np.array([0.0, np.inf]), np.array([[0.0, v, 0.0]])))
+        return not p.law.violations(p.params, restrict(scene, members))
+
+    def end(good: float, bad: float) -> float:
+        if takes(bad):
+            return bad
+        while abs(good - bad) > BAND_MPS:
+            middle = 0.5 * (good + bad)
+            good, bad = (middle, bad) if takes(middle) else (good, middle)
+        return good
+
+    top = cruise + (p.driving).catch_up_mps
+    return end(cruise, 0.0), end(cruise, top)

@@ -27,7 +27,7 @@ def facts(p: Prepared) -> dict[str, Any]:
         "plant": p.scenario.plant.kind,
         **(
             _traffic(p)
-            if p.roster is not None
+            if not p.placed
             else {
                 "line": f"{p.line.begin_m / 1000:g} .. {p.line.end_m / 1000:g} km, tracks {', '.join(p.line.track_ids)}",
                 "links_at_start": " ".join(f"{a}-{b}" for a, b in links),
@@ -52,7 +52,7 @@ def facts(p: Prepared) -> dict[str, Any]:
     if p.supervision.mode != "off" and p.law.CLOCK != "none":
         found["protection"] = promise.told(p)
         found["promise"] = promise.sentences(found["protection"])
-    notes = [] if p.roster is None else list(p.roster.notes)
+    notes = list(p.roster.notes)
     found["warnings"] = notes + list(p.law.warnings(p.params, scene, p.start_track)) if hasattr(p.law, "warnings") else notes
     found["report"] = list(p.law.report(p.params, scene, p.scenario.disturbance)) if hasattr(p.law, "report") else []
     if hasattr(p.law, "analysis"):
@@ -62,7 +62,6 @@ def facts(p: Prepared) -> dict[str, Any]:
 
 def _traffic(p: Prepared) -> dict[str, Any]:
     """Facts of trains that come and go, and of their net."""
-    assert p.roster is not None
     rails, roster, rules = p.roster.rails, p.roster, p.supervision
     normal = ~rails.internal
     together = [name for name, member in zip(p.scenario.ids, roster.cooperates, strict=True) if member]

@@ -54,7 +54,7 @@ class Parts(NamedTuple):
 def top_speed(p: Prepared) -> Floats:
     """Highest speed the line allows every train anywhere on its route, or that it starts with [m/s], shape (n,)."""
     start = p.own[p.heads, SPEED]
-    if p.roster is None:
+    if p.placed:
         highest: Floats = np.maximum(float(p.line.speed_mps.max()), start)
         return highest
     limit, index = p.rails.speed_mps, p.line.index
@@ -66,7 +66,7 @@ def top_speed(p: Prepared) -> Floats:
 
 def _slopes(p: Prepared) -> tuple[Floats, Floats]:
     """Steepest descent and ascent of every train's route, rise / run >= 0, shape (n,)."""
-    if p.roster is None:
+    if p.placed:
         breaks, slope = p.line.gradient.breaks, p.line.gradient.slope
         rear = p.own[p.heads, POSITION] - p.consists.train_length()
         first = np.maximum(np.searchsorted(breaks, rear, side="right") - 1, 0)
@@ -198,7 +198,7 @@ def _weak(p: Prepared) -> list[str]:
             f" {cures}"
         ]
     rate = p.driving.deceleration_mps2
-    if p.roster is not None and np.any(rate - assumed.scatter < LEAST_BRAKING):
+    if not p.placed and np.any(rate - assumed.scatter < LEAST_BRAKING):
         i = int(np.argmax(assumed.scatter))
         return [
             f"traffic.deceleration_mps2 = {rate:g}: disturbances and faults take {assumed.scatter[i]:.3g} m/s2 of it from train"
@@ -233,14 +233,12 @@ _DISTURBED = {
 
 def _lost(p: Prepared) -> list[str]:
     """Starts from which a collision or an overspeed cannot be averted. Trains that come later enter only where it is safe."""
-    if p.roster is not None:
+    if not p.placed:
         return []
     rules, speed, step = p.supervision, p.own[p.heads, SPEED], p.scenario.run.step_s
-    places = [p.line.locate(t.track, t.position_m) for t in p.scenario.train]
-    routes = [[p.line.index[e] for e in p.line.route(t.track, t.position_m)] for t in p.scenario.train]
-    laid = ways(routes, p.line.start_m, p.line.length_m)
+    laid = ways([[p.line.index[e] for e in route] for route in p.roster.routes], p.line.start_m, p.line.length_m)
     row, n = laid.first[:-1].copy(), len(speed)
-    front = laid.begin[row] + np.array([x for _, x in places])
+    front = laid.begin[row] + p.roster.lane_position
     fastest = float(supervisor.stopping_distance(speed, float(p.assumed.braking.min()), step, p.step_theta).max())
     view = authority.look(
         laid, along.net(p.rails), p.rails.speed_mps, np.ones(n), row, front, speed, p.consists.train_length(), np.ones(n, bool),

@@ -31,7 +31,7 @@ class Stop(NamedTuple):
 
 
 class Roster(NamedTuple):
-    """Trains that come and go, n of them."""
+    """All trains of a run, n of them: when and where they come, their routes and stops."""
 
     depart: Floats  # (n,) s
     edge: Ints  # (n,) first edge of the way
@@ -45,12 +45,25 @@ class Roster(NamedTuple):
     vclass: tuple[str, ...]
     notes: tuple[str, ...]  # what of the configuration is not followed
     rails: Rails
+    placed: bool  # by [[train]] tables, all there from the start; else they come and go
+
+
+def placed(scenario: Scenario, line: Line) -> Roster:
+    """Trains that stand on a line from the start and run to its end; free of the mistakes ``placing.on_the_line`` finds."""
+    n = len(scenario.train)
+    places = [line.locate(t.track, t.position_m) for t in scenario.train]
+    return Roster(
+        depart=np.zeros(n), edge=np.array([e for e, _ in places], np.int64), lane_position=np.array([x for _, x in places]),
+        speed=np.array([t.speed_mps for t in scenario.train], float), top_speed=np.full(n, np.inf), speed_factor=np.ones(n),
+        routes=tuple(line.route(t.track, t.position_m) for t in scenario.train), stops=((),) * n, cooperates=np.ones(n, bool),
+        vclass=("rail",) * n, notes=(), rails=Rails.of(line), placed=True,
+    )  # fmt: skip
 
 
 def tables(roster: Roster) -> dict[str, Any]:
     """A roster in what JSON knows, but for its net."""
     found = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in roster._asdict().items()}
-    del found["rails"]
+    del found["rails"], found["placed"]
     return found
 
 
@@ -66,6 +79,7 @@ def from_tables(data: Mapping[str, Any], net: Path) -> Roster:
         vclass=tuple(data["vclass"]),
         notes=tuple(data["notes"]),
         rails=Rails.read(net),
+        placed=False,
     )
 
 
@@ -149,6 +163,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         vclass=tuple(traffic.kinds[d.kind].vclass for d in departures),
         notes=traffic.notes,
         rails=rails,
+        placed=False,
     )
     return scenario.model_copy(update={"train": tuple(trains), "train_type": types}), roster, traffic.net
 

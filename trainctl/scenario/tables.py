@@ -15,7 +15,7 @@ from trainctl.plants.disturbance import Disturbance
 from trainctl.plants.faults import Fault
 from trainctl.railway.supervisor import Params as Supervisor
 from trainctl.scenario.reference import Profile
-from trainctl.signals import Bounds, Consists, Table
+from trainctl.signals import Bounds, Consists, Floats, Table
 
 SCHEMA_VERSION = 1
 
@@ -101,6 +101,11 @@ class Network(Table):
 
 class Traffic(Table):
     """[traffic]: how trains of a SUMO configuration are driven outside of formations, and when they form one."""
+
+    def below(self, limit: Floats) -> Floats:
+        """Speed the driver keeps where the limit is ``limit`` [m/s]."""
+        below: Floats = np.maximum(limit - self.below_limit_mps, 0.2 * limit)
+        return below
 
     cooperate: tuple[str, ...] = Field(
         ("*",), description="Trains that join formations, by id; * stands for anything. The others are driven by themselves."

@@ -17,9 +17,8 @@ from trainctl.railway import supervisor
 from trainctl.railway.ways import Ways
 from trainctl.scenario.build import Prepared
 from trainctl.scenario.tables import Event
-from trainctl.signals import Floats, Ints
+from trainctl.signals import Floats, Ints, Seen
 from trainctl.stages.record import Journal
-from trainctl.world import Seen
 
 
 class Refused(Exception):
@@ -30,30 +29,29 @@ class LeadsNowhere(Refused):
     """There is no such way from where the train is, braking distance or not."""
 
 
-class Reroutes:
-    """Orders still to come.
+class Orders:
+    """Orders of a run. Those of the scenario are numbered from 1 by their tables; more may be added from outside."""
 
-    Attributes
-    ----------
-    pending : list of (int, Event)
-        Number and order, by time.
-    """
-
-    def __init__(self, p: Prepared) -> None:
-        self.p = p
-        self.pending = sorted(enumerate(p.scenario.event, 1), key=lambda e: e[1].time_s)
+    def __init__(self, p: Prepared, journal: Journal) -> None:
+        self.p, self.journal = p, journal
+        self.known: list[Event] = list(p.scenario.event)
         self.length = p.consists.train_length()
         self.theta = p.step_theta
 
-    def add(self, event: Event) -> None:
-        """One more order."""
+    def initial(self) -> tuple[int, ...]:
+        """Numbers of the orders to come, by time."""
+        return tuple(number for number, _ in sorted(enumerate(self.known, 1), key=lambda e: e[1].time_s))
+
+    def add(self, event: Event) -> int:
+        """One more order; its number."""
         if event.train not in self.p.scenario.ids:
             raise ValueError(f"train {event.train}: no such train; there are: {', '.join(self.p.scenario.ids)}")
-        self.pending.append((len(self.p.scenario.event) + 1, event))
+        self.known.append(event)
+        return len(self.known)
 
-    def orders(
-        self, t: float, seen: Seen, ways: Ways, speed: Floats, ahead: Ints, journal: Journal
-    ) -> list[tuple[int, tuple[str, ...]]]:
+    def step(
+        self, t: float, seen: Seen, ways: Ways, speed: Floats, ahead: Ints, pending: tuple[int, ...]
+    ) -> tuple[tuple[int, ...], list[tuple[int, tuple[str, ...]]]]:
         """Orders whose time, place or condition has come: trains and their new routes.
 
         Parameters
@@ -66,20 +64,21 @@ class Reroutes:
             Their ways now.
         speed, ahead : ndarray, shape (n,)
             Speed [m/s], and the train ahead in the formation, -1 if none.
-        journal : Journal
-            Takes the events ``reroute`` and ``reroute_refused``.
+        pending : tuple of int
+            Numbers of the orders to come.
 
         Returns
         -------
+        tuple of int
+            Orders that are still to come.
         list of (int, tuple of str)
             Train and edges from the one it is on, internal ones included.
         """
         found: list[tuple[int, tuple[str, ...]]] = []
-        for number, event in list(self.pending):
+        due = [number for number in pending if self._is_due(t, self.known[number - 1], seen, speed, ahead)]
+        for number in due:
+            event = self.known[number - 1]
             i = self.p.scenario.ids.index(event.train)
-            if not self._is_due(t, event, i, seen, speed, ahead):
-                continue
-            self.pending.remove((number, event))
             lock = float(supervisor.stopping_distance(
                 np.maximum(speed[i : i + 1], 0.0), self.p.supervision.service_mps2, self.p.scenario.run.step_s, self.theta
             )[0])  # fmt: skip
@@ -94,17 +93,20 @@ class Reroutes:
                 if isinstance(why, LeadsNowhere) and self.p.scenario.supervisor is None and number <= len(self.p.scenario.event):
                     where = f"train {event.train} is at {seen.position[i]:.3f} m on track {self.p.line.tracks[seen.edge[i]]}"
                     raise InputError(f"{self.p.file}: event[{number}]: {why}; {where} at {t:g} s") from None
-                journal.event(
+                self.journal.event(
                     t, "reroute_refused", train=event.train, order=number, reason=str(why), position_m=float(seen.position[i]),
                     speed_mps=float(speed[i]),
                 )  # fmt: skip
                 continue
-            journal.event(t, "reroute", train=event.train, **more)
+            self.journal.event(t, "reroute", train=event.train, **more)
             found.append((i, edges))
-        return found
+        return tuple(number for number in pending if number not in due) if due else pending, found
 
-    def _is_due(self, t: float, event: Event, i: int, seen: Seen, speed: Floats, ahead: Ints) -> bool:
-        if event.time_s > t + 1e-9 or not seen.present[i]:
+    def _is_due(self, t: float, event: Event, seen: Seen, speed: Floats, ahead: Ints) -> bool:
+        if event.time_s > t + 1e-9:
+            return False
+        i = self.p.scenario.ids.index(event.train)
+        if not seen.present[i]:
             return False
         if event.position_m is not None and seen.position[i] < event.position_m:
             return False

@@ -1,4 +1,4 @@
-"""The plant as the loop drives it: the exact map of point trains, or units integrated jointly with observer and law."""
+"""The plant over one step: the exact map of point trains, or units integrated jointly with observer and law."""
 
 from __future__ import annotations
 
@@ -9,26 +9,53 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trainctl.plants import actuated_units, coupled_units, faults, integrate, point, shared
-from trainctl.plants.disturbance import Disturbed
 from trainctl.scenario.build import Prepared
-from trainctl.signals import FORCE, GRAVITY, POSITION, POWERS, SPEED, Bools, Demand, Floats, Links, Scene
-from trainctl.topology.exchange import Exchange
+from trainctl.signals import (
+    FORCE,
+    GRAVITY,
+    POSITION,
+    POWERS,
+    SPEED,
+    Demand,
+    Disturbed,
+    Extremes,
+    Floats,
+    Formed,
+    Links,
+    Messages,
+    Motion,
+    Scene,
+)  # fmt: skip
+from trainctl.topology import exchange
 
 #: A law may move a train within a step by so much [m] per second more or less than a held acceleration would.
 WITHIN_M = 0.02
 
 
-class Motion(NamedTuple):
-    """One simulator step of all trains."""
+class State(NamedTuple):
+    """What a plant of units remembers; of point trains every array is empty."""
 
-    displacement: Floats  # (n,) m, what SUMO is told to do
-    input: Floats  # (n,) m/s2, force of the whole train per mass at the beginning of the step
-    acceleration: Floats  # (n,) m/s2, mean over the step
-    asked: Floats  # (n,) m/s2, what drives the train, as the supervisor judges it
-    limited: Bools  # (n,) a limit of the plant acted
-    clipped: Bools  # (n,) the train would have moved backwards
-    force: Floats | None  # (U,) N at the beginning of the step
-    extras: dict[str, Floats]  # further columns of the units, (U,) each
+    estimate: Floats  # (U, q) of the observer
+    extremes: Extremes  # over the sub-steps since the last row
+    observer: Any  # its constants, for the present links
+    work: Any  # work space of the integrator
+    heard: Floats  # (L, w) what each link brought last
+    sent_at: float  # s, when that was sent
+    counted: int  # number of the last exchange, -1: none on these links
+
+
+class Moved(NamedTuple):
+    """What a step makes of the trains."""
+
+    own: Floats  # (U, s)
+    motion: Motion
+    messages: Messages
+    state: State
+
+
+def of(p: Prepared) -> Points | Units:
+    """The plant of a scenario."""
+    return Points(p) if p.scenario.plant.kind == "point" else Units(p)
 
 
 def _slopes(p: Prepared) -> Floats:
@@ -41,8 +68,13 @@ class Points:
     """Point trains under a sampled law."""
 
     def __init__(self, p: Prepared) -> None:
-        self.step = p.scenario.run.step_s
+        self.step_s = p.scenario.run.step_s
+        self.noisy = False
         self.constants = point.constants(p.plant_params, p.consists, gradient=_slopes(p))
+
+    def initial(self) -> State:
+        """Nothing to remember."""
+        return State(np.zeros((0, 0)), Extremes.fresh(0, 0, 0), (), (), np.zeros((0, 0)), 0.0, -1)
 
     def believed_resistance(self, own: Floats) -> Floats:
         """Running resistance and gradient at the present speed and place [N/kg], shape (n,)."""
@@ -51,17 +83,18 @@ class Points:
     def _climbing(self, own: Floats) -> Floats:
         return point.climbing(own[:, POSITION], self.constants.gradient) + GRAVITY * self.constants.slope
 
-    def advance(
-        self, k: int, t: float, own: Floats, demand: Demand, links: Links | None, exchange: Exchange, disturbed: Disturbed,
-        ordered: Floats, pace: Floats | None, calm: bool = False,
-    ) -> tuple[Floats, Motion]:  # fmt: skip
+    def step(
+        self, k: int, t: float, own: Floats, demand: Demand, ordered: Floats, formed: Formed, messages: Messages, state: State,
+        disturbed: Disturbed, calm: bool = False,
+    ) -> Moved:  # fmt: skip
         """One exact step of the discrete map; ``ordered`` (n,) accelerations stand for the law's where they are not NaN."""
         constants = self.constants._replace(resistance_factor=disturbed.resistance)
         kick = point.Kick(disturbed.position, disturbed.speed, disturbed.input)
         asked = np.where(np.isnan(ordered), demand.acceleration, ordered)
-        moved = point.advance(constants, own, asked, self.step, kick)
-        mean = (moved.own[:, SPEED] - own[:, SPEED]) / self.step
-        return moved.own, Motion(moved.displacement, moved.input, mean, mean, moved.limited, moved.clipped, None, {})
+        moved = point.advance(constants, own, asked, self.step_s, kick)
+        mean = (moved.own[:, SPEED] - own[:, SPEED]) / self.step_s
+        motion = Motion(moved.displacement, moved.input, mean, mean, moved.limited, moved.clipped, None, {})
+        return Moved(moved.own, motion, messages, state)
 
     def acceleration(self, own: Floats) -> Floats:
         """Nothing acts late here, so it does not matter."""
@@ -75,27 +108,26 @@ class Points:
         """Take the slope under every unit (U,), rise / run, for the coming step."""
         self.constants.slope[:] = slope
 
-    def saved(self) -> None:
-        """Nothing changes here from step to step."""
+    def relinked(self, scene: Scene, constants: Any, state: State) -> State:
+        """Nothing here depends on who hears whom."""
+        return state
 
-    def restore(self, saved: None) -> None:
-        """Nothing to go back to."""
+    def taken(self, state: State) -> tuple[Extremes | None, State]:
+        """No extremes: a point has no sub-steps."""
+        return None, state
 
 
 class Units:
-    """Trains of units, integrated jointly with observer and law in sub-steps; a sampled law's acceleration is shared out to them.
-
-    Holds what belongs to the integration: estimates, held messages, extremes since the last row.
-    """
+    """Trains of units, integrated jointly with observer and law; a sampled law's acceleration is shared out to them."""
 
     def __init__(self, p: Prepared) -> None:
         self.p = p
-        run = p.scenario.run
-        self.step, self.sub_steps = run.step_s, run.sub_steps
-        self.h = self.step / self.sub_steps
+        run, top = p.scenario.run, p.scenario.topology
+        self.step_s, self.sub_steps = run.step_s, run.sub_steps
+        self.h = self.step_s / self.sub_steps
         self.law: Any = shared if p.sampled else p.law
-        self.period = p.scenario.topology.communication_period_s
-        self.estimate: Floats = p.observer.initial(p.observer_params, p.own)
+        self.period = top.communication_period_s
+        self.radio = p.radio
         self.gradient = _slopes(p)
         self.plant: Any
         if p.scenario.plant.kind == "coupled_units":
@@ -106,22 +138,31 @@ class Units:
             )
         noisy = p.scenario.plant.kind == "actuated_units" and p.plant_params.noise_variance_m2_per_s6 > 0.0
         self.noise_hold = p.plant_params.noise_hold_s if noisy else None
+        self.noisy = noisy
         self.breaks = np.unique(
             np.concatenate([p.reference.breaks[np.isfinite(p.reference.breaks)], faults.breaks(p.scenario.fault)])
         )
         self.masses = p.consists.train_mass()
         self.lag = p.assumed.lag
-        self.extremes = self._fresh()
-        self.counted = -1  # number of the last exchange
-        guided = p.roster is not None
+        guided = not p.placed
         self.hilly = bool(len(self.gradient)) or (guided and bool(p.rails.slope.any()))
         ordered = guided or p.supervision.mode != "off"
+        # Written anew in every step before they are read, like the columns of the plant's table that disturb it.
+        self.told = shared.constants(p.plant_params, p.consists, self.gradient) if p.sampled else shared.NOBODY
         self.orders = integrate.Orders(
             held=shared.constants(p.plant_params, p.consists, self.gradient) if ordered and not p.sampled else shared.NOBODY,
             lift=np.zeros(len(p.own) if self.hilly and not p.sampled else 0),
             pace=np.zeros((len(self.masses) if guided else 0, 3)),
             since=0.0,
         )
+
+    def initial(self) -> State:
+        """Nothing seen, nothing heard; ``relinked`` makes the rest."""
+        estimate: Floats = self.p.observer.initial(self.p.observer_params, self.p.own)
+        return State(estimate, self._fresh(len(estimate)), (), (), np.zeros((0, self.law.MESSAGE)), 0.0, -1)
+
+    def _fresh(self, units: int) -> Extremes:
+        return Extremes.fresh(len(self.masses), units, len(self.law.WATCHED))
 
     def believed_resistance(self, own: Floats) -> Floats:
         """Running resistance and gradient of whole trains per mass [N/kg], shape (n,)."""
@@ -130,81 +171,85 @@ class Units:
         total: Floats = np.add.reduceat(c.mass * per_unit, c.first[:-1]) / self.masses
         return total
 
-    def taken(self) -> integrate.Extremes:
+    def taken(self, state: State) -> tuple[Extremes | None, State]:
         """Extremes since they were last taken."""
-        past, self.extremes = self.extremes, self._fresh()
-        return past
+        return state.extremes, state._replace(extremes=self._fresh(len(state.estimate)))
 
-    def _fresh(self) -> integrate.Extremes:
-        return integrate.Extremes.fresh(len(self.masses), len(self.estimate), len(self.law.WATCHED))
-
-    def relink(self, scene: Scene, constants: Any) -> None:
+    def relinked(self, scene: Scene, constants: Any, state: State) -> State:
         """Take over a new edge list; ``constants`` are the law's own (a sampled law does not run here)."""
-        p = self.p
-        own_law = shared.constants(p.plant_params, p.consists, self.gradient) if p.sampled else constants
-        self.loop = integrate.Loop(own_law, p.observer.constants(p.observer_params, scene), self.plant, self.orders)
-        messages = len(scene.links.sender), self.law.MESSAGE
-        self.air = integrate.Air(np.zeros(messages), self.period is None, self.law.ORDER == "chain", 0.0)
-        self.work = integrate.scratch(p.own, self.estimate, len(self.masses), p.observer.CORRECTIONS, self.law.MESSAGE)
-        self.counted = -1
+        p, links = self.p, scene.links
+        now = state._replace(
+            observer=p.observer.constants(p.observer_params, scene),
+            work=integrate.scratch(p.own, state.estimate, len(self.masses), p.observer.CORRECTIONS, self.law.MESSAGE),
+            heard=np.zeros((len(links.sender), self.law.MESSAGE)), sent_at=0.0, counted=-1,
+        )  # fmt: skip
+        loop, air = self._loop(constants, now, self.orders), self._air(now)
         self.parts = integrate.compiled(
             self.law, p.observer, p.plant,
-            (self.loop, p.consists.first, p.consists.length, scene.links, p.reference, self.air, 0.0, self.h, 1, self.breaks,
-             p.own, self.estimate, self.work, self.extremes),
+            (loop, p.consists.first, p.consists.length, links, p.reference, air, 0.0, self.h, 1, self.breaks, p.own, now.estimate,
+             now.work, now.extremes),
         )  # fmt: skip
+        return now
 
-    def advance(
-        self, k: int, t: float, own: Floats, demand: Demand, links: Links | None, exchange: Exchange, disturbed: Disturbed,
-        ordered: Floats, pace: Floats | None, calm: bool = False,
-    ) -> tuple[Floats, Motion]:  # fmt: skip
+    def _loop(self, constants: Any, state: State, orders: integrate.Orders) -> integrate.Loop:
+        return integrate.Loop(self.told if self.p.sampled else constants, state.observer, self.plant, orders)
+
+    def _air(self, state: State) -> integrate.Air:
+        return integrate.Air(state.heard, self.period is None, self.law.ORDER == "chain", state.sent_at)
+
+    def step(
+        self, k: int, t: float, own: Floats, demand: Demand, ordered: Floats, formed: Formed, messages: Messages, state: State,
+        disturbed: Disturbed, calm: bool = False,
+    ) -> Moved:  # fmt: skip
         """Integrate over one simulator step; the displacement is that of the heads. ``calm``: without the plant's noise.
 
-        Trains with an ``ordered`` (n,) acceleration, not NaN, hold that instead of what their law demands. ``pace`` (4, n) is where
-        each train's own reference is now, where they have one.
+        Trains with an ``ordered`` (n,) acceleration, not NaN, hold that instead of what their law demands. The arrays of ``state``
+        are reused: who tries a step first hands over a ``copied`` one.
         """
-        assert links is not None
         p, first, heads = self.p, self.p.consists.first, self.p.heads
-        if p.sampled:
-            self.loop.law.acceleration[:] = np.where(np.isnan(ordered), demand.acceleration, ordered)
-        elif len(self.orders.held.acceleration):
-            self.orders.held.acceleration[:] = ordered
+        told = np.where(np.isnan(ordered), demand.acceleration, ordered) if p.sampled else ordered
+        for held in (self.told, self.orders.held):
+            if len(held.acceleration):
+                held.acceleration[:] = told
         if len(self.orders.lift):
             self.orders.lift[:] = p.consists.mass * self._climbing(own)
-        if pace is not None and len(self.orders.pace):
-            self.orders.pace[:] = pace[:3].T
-            self.loop = self.loop._replace(orders=self.orders._replace(since=t))
+        orders = self.orders
+        if len(orders.pace):
+            assert formed.pace is not None
+            orders.pace[:] = np.stack(formed.pace).T
+            orders = orders._replace(since=t)
         self._disturb(disturbed)
+        loop, air, links = self._loop(formed.constants, state, orders), self._air(state), formed.links
+        assert links is not None
         moved = own.copy()
         moved[:, SPEED] += np.repeat(disturbed.speed, np.diff(first))
-        limited, estimate = self.extremes.limited.copy(), self.estimate.copy()
+        limited, estimate, counted = state.extremes.limited.copy(), state.estimate.copy(), state.counted
         demanded = None
         for begin, sub_steps in self._pieces(t):
-            self._exchange(begin, moved, links, exchange)
+            if self.period is not None and (number := math.floor(begin / self.period + 1e-6)) != counted:
+                messages, air = self._exchange(loop, air, begin, number, counted < 0, moved, links, messages, state)
+                counted = number
             self._make_noise(begin, calm)
             applied = integrate.advance(
-                self.parts, self.loop, first, p.consists.length, links, p.reference, self.air, begin, self.h, sub_steps,
-                self.breaks, moved, self.estimate, self.work, self.extremes,
+                self.parts, loop, first, p.consists.length, links, p.reference, air, begin, self.h, sub_steps, self.breaks, moved,
+                state.estimate, state.work, state.extremes,
             )  # fmt: skip
             demanded = applied if demanded is None else demanded
         assert demanded is not None
-        extras = self._extras(t, own, estimate, demanded)
+        extras = self._extras(t, own, estimate, demanded, loop)
         force = own[:, FORCE].copy() if p.plant.STATES > FORCE else demanded
         displacement = moved[heads, POSITION] - own[heads, POSITION] + np.where(own[heads, SPEED] > 0.0, disturbed.position, 0.0)
         clipped = displacement < 0.0
         displacement[clipped] = 0.0
         shift = np.repeat(own[heads, POSITION] + displacement - moved[heads, POSITION], np.diff(first))
         moved[:, POSITION] += shift
-        mean = (moved[heads, SPEED] - own[heads, SPEED]) / self.step
-        return moved, Motion(
+        mean = (moved[heads, SPEED] - own[heads, SPEED]) / self.step_s
+        motion = Motion(
             displacement=displacement, input=np.add.reduceat(force, heads) / self.masses, acceleration=mean,
-            asked=self._asked(own, moved, displacement, mean),
-            limited=self.extremes.limited > limited, clipped=clipped, force=force, extras=extras,
+            asked=self._asked(own, moved, displacement, mean), limited=state.extremes.limited > limited, clipped=clipped,
+            force=force, extras=extras,
         )  # fmt: skip
-
-    def _climbing(self, own: Floats) -> Floats:
-        """Weight along the track per mass [N/kg], (U,)."""
-        force: Floats = point.climbing(own[:, POSITION], self.gradient) + GRAVITY * self.plant.units[:, coupled_units.SLOPE]
-        return force
+        return Moved(moved, motion, messages, state._replace(heard=air.heard, sent_at=air.sent_at, counted=counted))
 
     def _asked(self, own: Floats, moved: Floats, displacement: Floats, mean: Floats) -> Floats:
         """Acceleration that drives every train over the step [m/s2], (n,).
@@ -215,12 +260,17 @@ class Units:
         heads = self.p.heads
         v, after = own[heads, SPEED], moved[heads, SPEED]
         if self.p.plant.STATES > FORCE:
-            gained = self.lag * (self.acceleration(moved) - self.acceleration(own)) / self.step
+            gained = self.lag * (self.acceleration(moved) - self.acceleration(own)) / self.step_s
             return np.where(after > 0.0, mean + gained, mean)
-        beyond = displacement - 0.5 * (v + after) * self.step
-        explained = mean + 2.0 * beyond / self.step**2
-        swings = (np.abs(beyond) > WITHIN_M * self.step) & (after > 0.0)
+        beyond = displacement - 0.5 * (v + after) * self.step_s
+        explained = mean + 2.0 * beyond / self.step_s**2
+        swings = (np.abs(beyond) > WITHIN_M * self.step_s) & (after > 0.0)
         return np.where(swings, explained, mean)
+
+    def _climbing(self, own: Floats) -> Floats:
+        """Weight along the track per mass [N/kg], (U,)."""
+        force: Floats = point.climbing(own[:, POSITION], self.gradient) + GRAVITY * self.plant.units[:, coupled_units.SLOPE]
+        return force
 
     def acceleration(self, own: Floats) -> Floats:
         """Acceleration of every train now, where actuators make it a state [m/s2], (n,)."""
@@ -244,24 +294,11 @@ class Units:
 
     def climbs(self, slope: Floats) -> None:
         """Take the slope under every unit (U,), rise / run, for the coming step."""
-        self.plant.units[:, coupled_units.SLOPE] = slope
-        if self.p.sampled:
-            self.loop.law.units[:, coupled_units.SLOPE] = slope
-        elif len(self.orders.held.acceleration):
-            self.orders.held.units[:, coupled_units.SLOPE] = slope
+        for table in (self.plant.units, self.told.units, self.orders.held.units):
+            if len(table):
+                table[:, coupled_units.SLOPE] = slope
 
-    def saved(self) -> Any:
-        """What a step changes here, to try one."""
-        return self.estimate.copy(), integrate.Extremes(*(a.copy() for a in self.extremes)), self.counted, self.air
-
-    def restore(self, saved: Any) -> None:
-        """Go back to before a step that was tried."""
-        estimate, extremes, self.counted, self.air = saved
-        self.estimate[:] = estimate
-        for now, then in zip(self.extremes, extremes, strict=True):
-            now[:] = then
-
-    def _extras(self, t: float, own: Floats, estimate: Floats, demanded: Floats) -> dict[str, Floats]:
+    def _extras(self, t: float, own: Floats, estimate: Floats, demanded: Floats, loop: integrate.Loop) -> dict[str, Floats]:
         """What actuators, faults and observers do at ``t``, for the log."""
         if self.p.plant.STATES <= FORCE:
             return {}
@@ -272,7 +309,7 @@ class Units:
         return {
             "law_input": demanded,
             "fault_mps3": actuated_units.fault(self.plant, t, demanded),
-            "fault_estimate_mps3": self.p.observer.fault_estimate(self.loop.observer, estimate),
+            "fault_estimate_mps3": self.p.observer.fault_estimate(loop.observer, estimate),
             "acceleration_mps2": rate[:, SPEED],
             "acceleration_estimate_mps2": estimate[:, self.p.law.W],
         }
@@ -281,27 +318,26 @@ class Units:
         """(start, sub-steps) of the stretches of one simulator step within which messages and noise are held."""
         cuts = {0}
         for period in (self.period, self.noise_hold):
-            if period is not None and period < self.step:
+            if period is not None and period < self.step_s:
                 cuts |= set(range(0, self.sub_steps, round(period / self.h)))
         starts = sorted(cuts)
         return [(t + a * self.h, b - a) for a, b in pairwise([*starts, self.sub_steps])]
 
-    def _exchange(self, t: float, own: Floats, links: Links, exchange: Exchange) -> None:
-        """Send and hear, if an exchange is due at ``t``. A link opens with a message that arrives."""
-        if self.period is None:
-            return
-        number = math.floor(t / self.period + 1e-6)
-        if number == self.counted:
-            return
-        # On a new edge list nothing has been heard yet: the first messages are those of one common instant.
-        air = self.air._replace(live=True) if self.counted < 0 else self.air
-        self.counted = number
-        first = self.p.consists.first
-        integrate.exchange(self.parts, self.loop, first, links, self.p.reference, air, t, own, self.estimate, self.work)
-        exchange.deliver(self.work.sent.copy(), own[self.p.heads, POSITION], links, number)
-        fresh = ~exchange.ever
-        exchange.heard[fresh] = self.work.sent[links.sender[fresh]]
-        self.air = self.air._replace(heard=exchange.heard.copy(), sent_at=t)
+    def _exchange(
+        self, loop: integrate.Loop, air: integrate.Air, t: float, number: int, first_time: bool, own: Floats, links: Links,
+        messages: Messages, state: State,
+    ) -> tuple[Messages, integrate.Air]:  # fmt: skip
+        """Send and hear at ``t``. A link opens with a message that arrives.
+
+        On a new edge list nothing has been heard yet: the first messages are those of one common instant.
+        """
+        first, sent = self.p.consists.first, state.work.sent
+        live = air._replace(live=True) if first_time else air
+        integrate.exchange(self.parts, loop, first, links, self.p.reference, live, t, own, state.estimate, state.work)
+        messages, _ = exchange.deliver(self.radio, messages, sent.copy(), own[self.p.heads, POSITION], links, number)
+        fresh = ~messages.ever
+        messages.heard[fresh] = sent[links.sender[fresh]]
+        return messages, air._replace(heard=messages.heard.copy(), sent_at=t)
 
     def _make_noise(self, t: float, calm: bool) -> None:
         """Overwrite the plant's noise with the sample at ``t``, or with none."""
@@ -311,7 +347,7 @@ class Units:
             self.plant.units[:, actuated_units.NOISE] = 0.0
             return
         sample = math.floor(t / self.noise_hold + 1e-6)
-        noise = actuated_units.noise(self.p.plant_params, self.p.scenario.run.seed or 0, sample, len(self.estimate))
+        noise = actuated_units.noise(self.p.plant_params, self.p.scenario.run.seed or 0, sample, len(self.plant.units))
         self.plant.units[:, actuated_units.NOISE] = noise
 
     def _disturb(self, disturbed: Disturbed) -> None:
@@ -320,3 +356,8 @@ class Units:
         table = self.plant.units
         table[:, coupled_units.PUSH] = np.repeat(disturbed.input, units)
         table[:, coupled_units.C0 : coupled_units.C2 + 1] = self.p.consists.davis * np.repeat(disturbed.resistance, units)[:, None]
+
+
+def copied(state: State) -> State:
+    """The same in arrays of its own, to try a step with."""
+    return state._replace(estimate=state.estimate.copy(), extremes=Extremes(*(a.copy() for a in state.extremes)))

@@ -1,122 +1,87 @@
-"""Trains among each other on a net: who is ahead, whose turn it is at a switch, and what the supervisor allows.
-
-This is the part of the loop that knows ways. Trains that come and go are in ``service``.
-"""
+"""Protection: the supervisor tries the step without what disturbs it, and bounds what would be too much."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from trainctl.railway import along, authority, interlocking, supervisor
+from trainctl.railway import authority, supervisor
 from trainctl.railway.authority import View
-from trainctl.railway.supervisor import KINDS
-from trainctl.railway.ways import Ways
+from trainctl.railway.supervisor import KINDS, applied
 from trainctl.scenario.build import Prepared
-from trainctl.signals import Bools, Floats, Ints
+from trainctl.signals import SPEED, Bools, Disturbed, Floats
+from trainctl.stages import plant
+from trainctl.stages.driver import Driven
 from trainctl.stages.record import Journal
-from trainctl.world import Seen
 
-#: What the driver keeps clear beyond the supervisor's margin, so that the latter has nothing to do [m].
-DRIVER_MARGIN_M = 10.0
-
-
-class Lookout:
-    """Claims, and what is ahead of every train: state of the railway that all runs with ways have.
-
-    Attributes
-    ----------
-    claims : interlocking.State
-        Who has which switch and single track.
-    waits_for : ndarray, shape (n,)
-        Train that each is held by at a switch, -1 if none.
-    """
-
-    def __init__(self, p: Prepared) -> None:
-        self.p = p
-        self.rails, self.net = p.rails, along.net(p.rails)
-        self.length = p.consists.train_length()
-        self.factor = np.ones(len(self.length)) if p.roster is None else p.roster.speed_factor
-        self.claims = interlocking.none()
-        self.waits_for: Ints = np.full(len(self.length), -1)
-        self.theta = p.step_theta
-        rules = p.supervision
-        planned = [rules.service_mps2] + ([p.driving.deceleration_mps2] if p.roster else [])
-        self.assumed = p.assumed
-        self.rate = np.minimum(self.assumed.braking, min(rules.emergency_mps2, *planned))
-        self.ways: Ways | None = None
-
-    def _reach(self, speed: Floats) -> Floats:
-        """How far ahead every train claims [m]: farther than it would brake for what it must not enter."""
-        assumed, step = self.assumed, self.p.scenario.run.step_s
-        v = np.maximum(speed, 0.0) + assumed.drift + 2.0 * assumed.lag * self.p.supervision.emergency_mps2
-        braking = supervisor.stopping_distance(v, self.rate, step, self.theta)
-        clear = self.p.supervision.margin_m + 2.0 * DRIVER_MARGIN_M + 50.0 + 6.0 * assumed.uncertainty
-        return braking + 4.0 * v * step + clear
-
-    def claim(self, t: float, ways: Ways, seen: Seen, speed: Floats, journal: Journal, entering: Bools) -> interlocking.Held:
-        """Let every train claim what lies within its reach; ``entering`` (n,) are those that ask to enter the net."""
-        if self.ways is not ways:  # they changed
-            self.ways, self.zones = ways, interlocking.zones(ways, self.net)
-        self.claims, held, said = interlocking.claim(
-            self.zones, self.claims, seen.row, seen.position, self.length, seen.present, self._reach(speed),
-            self.p.supervision.margin_m + DRIVER_MARGIN_M, entering,
-        )  # fmt: skip
-        self._tell(journal, t, said, held)
-        return held
-
-    def look(self, ways: Ways, seen: Seen, speed: Floats, held: interlocking.Held) -> View:
-        """What is ahead of every train."""
-        horizon = float(np.max(self._reach(speed), where=seen.present, initial=0.0)) + 1000.0
-        if self.p.roster is not None:
-            horizon = max(horizon, self.p.driving.join_range_m)
-        return authority.look(
-            ways, self.net, self.rails.speed_mps, self.factor, seen.row, seen.position, speed, self.length, seen.present, horizon,
-            held.room, interlocking.order(self.claims),
-        )  # fmt: skip
-
-    def _tell(self, journal: Journal, t: float, said: list[interlocking.Decision], held: interlocking.Held) -> None:
-        """Switches that another train has first, and those that became free."""
-        ids, edges = self.p.scenario.ids, self.rails.edges
-        for one in said:
-            if one.by >= 0:
-                journal.event(
-                    t, "conflict", train=ids[one.train], first=ids[one.by], edge=edges[one.zone],
-                    place="join" if one.join else "single_track",
-                )  # fmt: skip
-            elif one.granted and not one.join and self.waits_for[one.train] >= 0:
-                journal.event(t, "switch_granted", train=ids[one.train], edge=edges[one.zone])
-        self.waits_for = held.by.copy()
+#: The plant over this step, for ordered accelerations (n,) and what disturbs: (ordered, disturbed, state, calm).
+OverTheStep = Callable[[Floats, Disturbed, plant.State, bool], plant.Moved]
 
 
-class Supervision:
-    """The supervisor of a run: bounds accelerations, and tells when it begins and ends to do so.
+class Protect:
+    """The supervisor of a run: bounds accelerations, and tells when it begins and ends to do so."""
 
-    Attributes
-    ----------
-    acting : ndarray, shape (n,)
-        Trains it acts on, or would act on.
-    """
+    def __init__(self, p: Prepared, journal: Journal, disturbing: bool) -> None:
+        self.p, self.rules, self.journal = p, p.supervision, journal
+        self.disturbing = disturbing
 
-    def __init__(self, p: Prepared) -> None:
-        self.p, self.rules = p, p.supervision
-        self.acting: Bools = np.zeros(len(p.scenario.ids), bool)
-        self.theta = p.step_theta
+    def step(
+        self, t: float, view: View | None, own: Floats, acceleration: Floats, driven: Driven, stands: Bools, disturbed: Disturbed,
+        state: plant.State, acting: Bools, over_the_step: OverTheStep,
+    ) -> tuple[plant.Moved, Bools]:  # fmt: skip
+        """The plant over one step within what the supervisor allows, and the trains (n,) it acts on.
 
-    def verdict(self, view: View, speed: Floats, acceleration: Floats, error: Floats) -> supervisor.Verdict:
+        Parameters
+        ----------
+        t : float
+            Now [s].
+        view : View or None
+            What is ahead; None: nobody looks, nobody protects.
+        own : ndarray, shape (U, s)
+            State of all units.
+        acceleration : ndarray, shape (n,)
+            Of every train now [m/s2].
+        driven : Driven
+            What drivers order; NaN: as the law demands.
+        stands : ndarray of bool, shape (n,)
+            Trains that are held where they are, or are not there.
+        disturbed : Disturbed
+            What acts in this step. The supervisor only knows the error of a measured position as that position.
+        state : plant.State
+            Of the plant.
+        acting : ndarray of bool, shape (n,)
+            Trains it acted on in the step before.
+        over_the_step : callable
+            The plant.
+        """
+        if view is None or self.rules.mode == "off":
+            return over_the_step(driven.ordered, disturbed, state, False), acting
+        verdict = self._verdict(view, own[self.p.heads, SPEED], acceleration, disturbed.measurement)
+        moved = over_the_step(driven.ordered, disturbed.calm(), plant.copied(state), True)
+        within, acts = applied(verdict, moved.motion.asked)
+        acts &= ~stands
+        acts_on = self.rules.mode == "on" and bool(acts.any())
+        if acts_on or self.disturbing:
+            ordered = np.where(acts, within, driven.ordered) if acts_on else driven.ordered
+            moved = over_the_step(ordered, disturbed, state, False)
+        self._tell(t, verdict, acts, acting, view, own[self.p.heads, SPEED])
+        return moved, acts
+
+    def _verdict(self, view: View, speed: Floats, acceleration: Floats, error: Floats) -> supervisor.Verdict:
         """What every train may do over the coming step; ``error`` (n,) is that of the measured positions [m]."""
         targets, limits = authority.measured(view.targets, view.limits, error)
         clear = targets if view.clear is view.targets else authority.measured(view.clear, view.limits, error)[0]
         return authority.judge(
-            self.rules, speed, targets, clear, limits, self.p.scenario.run.step_s, self.theta, self.p.assumed, acceleration
+            self.rules, speed, targets, clear, limits, self.p.scenario.run.step_s, self.p.step_theta, self.p.assumed, acceleration
         )
 
-    def tell(self, journal: Journal, t: float, verdict: supervisor.Verdict, acts: Bools, view: View, speed: Floats) -> None:
+    def _tell(self, t: float, verdict: supervisor.Verdict, acts: Bools, acting: Bools, view: View, speed: Floats) -> None:
         """Events where it begins or ends to act."""
         ids, targets = self.p.scenario.ids, view.targets
         others, rooms = (np.concatenate(pair) for pair in ((targets.other, view.clear.other), (targets.room, view.clear.room)))
-        for i in np.flatnonzero(acts & ~self.acting).tolist():
+        for i in np.flatnonzero(acts & ~acting).tolist():
             reason, row = int(verdict.reason[i]), int(verdict.target[i])
             more: dict[str, Any] = {"reason": KINDS[reason] if reason >= 0 else "acceleration"}
             if 0 <= reason < len(KINDS) - 1:
@@ -124,10 +89,9 @@ class Supervision:
                 more |= {"room_m": float(rooms[row])} | ({"other": ids[other]} if other >= 0 else {})
             elif reason >= 0:
                 more |= {"limit_mps": float(view.limits.speed[row]), "distance_m": float(view.limits.distance[row])}
-            journal.event(
+            self.journal.event(
                 t, "supervisor", train=ids[i], mode=self.rules.mode, emergency=bool(verdict.emergency[i]),
                 speed_mps=float(speed[i]), **more,
             )  # fmt: skip
-        for i in np.flatnonzero(self.acting & ~acts).tolist():
-            journal.event(t, "supervisor_released", train=ids[i])
-        self.acting = acts
+        for i in np.flatnonzero(acting & ~acts).tolist():
+            self.journal.event(t, "supervisor_released", train=ids[i])

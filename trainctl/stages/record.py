@@ -1,4 +1,4 @@
-"""What the loop hands over each step, as rows of the run folder's tables."""
+"""What is written of a run: its rows and events, and the alarms of what must hold."""
 
 from __future__ import annotations
 
@@ -7,41 +7,24 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from trainctl.monitors import bounds as monitor
 from trainctl.record.recorder import ENERGIES, UNIT_EXTRAS, Recorder, standard_tables
-from trainctl.signals import POSITION, SPEED, Bools, Floats, Ints, Links
+from trainctl.signals import POSITION, SPEED, Bools, Demand, Disturbed, Extremes, Floats, Formed, Motion, Row, Scene, Seen
+from trainctl.topology import graph
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from trainctl.plants.disturbance import Disturbed
-    from trainctl.plants.integrate import Extremes
+    from trainctl.railway.ways import Ways
     from trainctl.scenario.build import Prepared
-    from trainctl.stages.plant import Motion
-    from trainctl.world import Seen
-
-
-class Row(NamedTuple):
-    """One instant: the state that holds at ``time`` and what is applied from then on (None at the end)."""
-
-    time: float  # s
-    seen: Seen
-    track: Ints  # (n,)
-    own: Floats  # (U, s)
-    speed: Floats  # (n,) m/s, of the heads
-    ahead: Ints  # (n,) train ahead in the formation, -1 for the first
-    links: Links
-    motion: Motion | None
-    saturated: Bools  # (n,)
-    extremes: Extremes | None  # over the sub-steps since the last row
-    disturbed: Disturbed | None  # what acts from this instant on
-    led: Bools | None = None  # (n,) trains the law drives; None: all
-
+    from trainctl.stages.traffic import Around
+    from trainctl.stages.traffic import State as Traffic
 
 #: A killed run loses at most what it recorded in this time [s].
 SAVE_EVERY_S = 10.0
 
-#: Columns of trains.parquet in a run with disturbances, as in ``plants.disturbance.Disturbed``.
+#: Columns of trains.parquet in a run with disturbances, as in ``plants.Disturbed``.
 DISTURBANCES = (
     "disturbance_position_m", "disturbance_speed_mps", "disturbance_input_mps2", "resistance_factor", "measurement_error_m",
 )  # fmt: skip
@@ -52,6 +35,7 @@ class Journal:
 
     def __init__(self, folder: Path, p: Prepared, resume: Mapping[str, Any] | None = None) -> None:
         self.p = p
+        self.silent = False  # while a run that is resumed begins again
         self.has_units = p.scenario.plant.kind != "point"
         watched = tuple(getattr(p.law, "WATCHED", ())) if self.has_units and not p.sampled else ()
         self.watched = watched
@@ -60,7 +44,7 @@ class Journal:
         tables = standard_tables(
             p.scenario.ids, p.line.track_ids, p.line.edges, units=self.has_units, watched=watched,
             train_extras=(
-                *(ENERGIES if self.has_units else ()), *self.disturbances, *(("in_formation",) if p.roster is not None else ()),
+                *(ENERGIES if self.has_units else ()), *self.disturbances, *(() if p.placed else ("in_formation",)),
             ),
             unit_extras=self.extras,
         )  # fmt: skip
@@ -73,6 +57,8 @@ class Journal:
 
     def event(self, time: float, kind: str, **fields: Any) -> None:
         """One line of events.jsonl."""
+        if self.silent:
+            return
         self.recorder.event(round(time, 9), kind, **fields)
 
     def write(self, row: Row) -> None:
@@ -89,7 +75,7 @@ class Journal:
         if self.disturbances:
             acting = [np.full(n, np.nan)] * len(self.disturbances) if row.disturbed is None else row.disturbed
             extra |= dict(zip(self.disturbances, acting, strict=True))
-        if row.led is not None:
+        if not self.p.placed:
             extra["in_formation"] = row.led.astype(float)
         columns = dict(
             train=np.arange(n), track=row.track, edge=row.seen.edge, position_m=row.seen.position,
@@ -149,3 +135,72 @@ def _widened(pick: Any, extreme: Floats, now: Floats) -> Floats:
     """Extreme of the sub-steps since the last row, this instant included."""
     widened: Floats = pick(_finite(extreme), now)
     return widened
+
+
+class State(NamedTuple):
+    """What recording remembers."""
+
+    alarms: monitor.State
+    acting: Bools  # (n,) trains the supervisor acts on
+
+
+class Record:
+    """Hands every instant to the journal, and watches the bounds at every step, recorded or not."""
+
+    def __init__(self, p: Prepared, journal: Journal) -> None:
+        self.p, self.journal = p, journal
+        self.alarms = monitor.Alarms(p)
+        self.track_of = np.array([p.line.track_ids.index(t) for t in p.line.tracks], np.int64)
+
+    def initial(self) -> State:
+        """Nothing seen."""
+        return State(self.alarms.initial(), np.zeros(len(self.p.scenario.ids), bool))
+
+    def due(self, k: int) -> bool:
+        """Whether a row is written at step ``k``."""
+        return k % self.p.scenario.run.recorded_steps == 0 or k == self.p.scenario.run.steps
+
+    def relinked(self, t: float, scene: Scene, formed: Formed, s: State) -> None:
+        """Take over the law's bounds on new links; tell of a formation that is in pieces."""
+        groups = graph.components(len(scene.trains), scene.links.sender, scene.links.receiver)
+        for alarm in self.alarms.relinked(t, groups, formed.formation, scene, s.alarms):
+            self.journal.event(t, "violation", **alarm)
+
+    def step(
+        self, k: int, t: float, ways: Ways, here: Seen, seen: Seen, own: Floats, formed: Formed, demand: Demand,
+        motion: Motion | None, past: Extremes | None, disturbed: Disturbed | None, s: State,
+    ) -> None:  # fmt: skip
+        """One instant: alarms, then its row, if one is due.
+
+        Parameters
+        ----------
+        k, t : int, float
+            Step and time [s].
+        ways, here : Ways, Seen
+            Where the world has the trains, along their own routes.
+        seen : Seen
+            The same with positions along their formations.
+        own, formed, demand
+            State of all units, formations, what the law asked for.
+        motion, disturbed
+            What is applied from this instant on; None at the end.
+        past : Extremes or None
+            Of the sub-steps since the last row, where a row is due.
+        s : State
+            Its alarms are updated.
+        """
+        assert formed.links is not None
+        row = Row(
+            time=t, seen=seen, track=self.track_of[seen.edge], own=own, speed=own[self.p.heads, SPEED], ahead=formed.ahead,
+            links=formed.links, motion=motion, saturated=demand.saturated if motion is None else demand.saturated | motion.limited,
+            extremes=past, disturbed=disturbed, led=formed.led,
+        )  # fmt: skip
+        for alarm in self.alarms.new(row, ways, here, s.alarms):
+            self.journal.event(t, "violation", **alarm)
+        if self.due(k):
+            self.journal.write(row)
+
+    def waits(self, t: float, here: Seen, speed: Floats, traffic: Traffic, around: Around, due: Sequence[int], s: State) -> None:
+        """Tell of long waits and of circles."""
+        for kind, told in self.alarms.waits(t, here, speed, traffic, around, due, s.alarms):
+            self.journal.event(t, kind, **told)

@@ -33,11 +33,10 @@ from trainctl.record.folder import about_run, claim, finish, held, remove, write
 from trainctl.record.recorder import ENERGIES, Recorder, standard_tables
 from trainctl.runs.run import Run
 from trainctl.scenario.build import Prepared
-from trainctl.signals import GRAVITY, POWERS, Bools, Floats, Ints
-from trainctl.stages.orders import Reroutes
+from trainctl.signals import GRAVITY, POWERS, Bools, Floats, Ints, Seen
+from trainctl.stages.orders import Orders
 from trainctl.sumo.baseline_files import departures, network, write_configuration, write_routes
 from trainctl.sumo.session import LOGS, TOLERANCE_M, collisions, messages, normal
-from trainctl.world import Seen
 
 #: A bound counts as broken beyond this.
 ROUNDING = 1e-6
@@ -115,7 +114,7 @@ def body(p: Prepared) -> Body:
         rotating=np.add.reduceat(c.mass * c.rotating, c.first[:-1]) / mass,
         davis=point.constants(point.Params(), c).davis,
         gradient=slopes if slopes[:, 1].any() else np.zeros((0, 2)),
-        slope=None if p.roster is None else p.rails.slope,
+        slope=None if p.placed else p.rails.slope,
     )
 
 
@@ -187,10 +186,13 @@ class Session:
         rate = BRAKING_MPS2[p.params.train_type]
         protected = supervisor.Params(mode="on", service_mps2=rate, emergency_mps2=rate)
         self.at: Ints = self.ways.first[:-1].copy()  # rows of the edges the trains were last seen on
-        self.reroutes = Reroutes(replace(p, scenario=p.scenario.model_copy(update={"supervisor": protected})))
+        journal: Any = self  # takes the events
+        self.orders = Orders(replace(p, scenario=p.scenario.model_copy(update={"supervisor": protected})), journal)
+        self.pending = self.orders.initial()
         self.entered: Bools = np.zeros(len(self.number), bool)
         self.energy = np.zeros((len(self.number), len(POWERS)))
-        self.tally, self.watch = Tally(), on_track.of(p, self.line)
+        self.tally, self.watch = Tally.empty(), on_track.of(p, self.line)
+        self.last = self.watch.initial()
         self.missing: list[str] = []
         self.k = 0
         write_routes(p, self.departures, self.place / "trains.rou.xml")
@@ -267,7 +269,7 @@ class Session:
             now.position[i] = self.ways.begin[row] + vehicle.getLanePosition(name)
             now.speed[i] = vehicle.getSpeed(name)
         self.at = np.where(now.row >= 0, now.row, self.at)
-        if self.p.roster is None:
+        if self.p.placed:
             self._ahead_on_track(now)
         else:
             for name in there:
@@ -325,10 +327,10 @@ class Session:
 
     def _reroute(self, now: State) -> None:
         """Order the reroutes whose time, place or condition has come."""
-        if not self.reroutes.pending:
+        if not self.pending:
             return
-        journal: Any = self  # takes the events
-        for i, edges in self.reroutes.orders(self.time, now.seen, self.ways, now.speed, now.ahead, journal):
+        self.pending, routes = self.orders.step(self.time, now.seen, self.ways, now.speed, now.ahead, self.pending)
+        for i, edges in routes:
             self._call(libsumo.vehicle.setRoute, self.p.scenario.ids[i], normal(edges))
             onward, before = [self.line.index[e] for e in edges], self.ways.first[:-1]
             self.ways = rerouted(self.ways, i, int(now.row[i]), onward, self.line.start_m, self.line.length_m)
@@ -344,7 +346,7 @@ class Session:
                 self.event(self.time, "arrive", train=name)
                 continue
             old, new = (self.line.tracks[s.edge[i]] for s in (now, later))
-            if old != new and self.p.roster is None:
+            if old != new and self.p.placed:
                 self.event(self.time, "leave", train=name, track=old)
                 self.event(self.time, "join", train=name, track=new)
 
@@ -360,7 +362,7 @@ class Session:
             for i in np.flatnonzero(broken).tolist():
                 for told in self.tally.once(self.time, bound, ids[i], float(value[i]), float(limit[i])):
                     self.event(self.time, "violation", **told)
-        for wrong in self.watch.broken(self.ways, now.seen, now.speed):
+        for wrong in self.watch.broken(self.ways, now.seen, now.speed, self.last):
             for told in self.tally.once(self.time, **wrong):
                 self.event(self.time, "violation", **told)
 

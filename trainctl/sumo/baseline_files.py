@@ -71,7 +71,7 @@ def departures(p: Prepared) -> list[Departure]:
     InputError
         They cannot enter where ``entry_m`` says.
     """
-    if p.roster is not None:
+    if not p.placed:
         return _coming(p)
     line, entry = p.line, p.params.entry_m
     if entry is not None and not line.begin_m <= entry < line.end_m:
@@ -99,7 +99,6 @@ def _top_speeds(p: Prepared) -> Floats:
 def _coming(p: Prepared) -> list[Departure]:
     """The trains of a SUMO configuration, as its files have them."""
     roster, rails = p.roster, p.rails
-    assert roster is not None
     found = []
     for i, name in enumerate(p.scenario.ids):
         way = [rails.index[e] for e in roster.routes[i]]

@@ -23,9 +23,8 @@ import traci
 
 from sumo_net import Line
 from trainctl.errors import InputError, SimulatorError
-from trainctl.signals import Floats, Ints, Links
+from trainctl.signals import Floats, Ints, Links, Start
 from trainctl.sumo.session import Sumo
-from trainctl.world import Start
 
 #: First of a formation; any other member; a train that hears nobody. Told apart by the colour-blind too.
 FIRST, MEMBER, ALONE = (213, 94, 0, 255), (0, 114, 178, 255), (120, 120, 120, 255)

@@ -18,10 +18,9 @@ from trainctl.runs.run import Run
 from trainctl.scenario.reading import examine
 from trainctl.scenario.roster import chart
 from trainctl.scenario.tables import Scenario
-from trainctl.signals import Bools, Floats, Ints, Links
+from trainctl.signals import Bools, Floats, Ints, Links, Start
 from trainctl.sumo.gui import Gui, Map
 from trainctl.topology import graph
-from trainctl.world import Start
 
 
 def replay(run: Run, binary: str = "sumo-gui", from_s: float = 0.0, delay_ms: float = 20.0) -> int:

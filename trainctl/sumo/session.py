@@ -22,11 +22,11 @@ import numpy as np
 
 from sumo_net import Line
 from trainctl.errors import CouplingError, SimulatorError
+from trainctl.numeric import lay_out
 from trainctl.railway.ways import rerouted
 from trainctl.runs.sumo_logs import elements
-from trainctl.signals import Bools, Floats, Ints, Links
+from trainctl.signals import Bools, Floats, Ints, Links, Seen, Start
 from trainctl.sumo.preflight import objections
-from trainctl.world import Seen, Start, lay_out
 
 #: Speed mode 32 switches off every speed correction of SUMO's; each inserted train starts with all of them on (31).
 SPEED_MODE_FREE = 32

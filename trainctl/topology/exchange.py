@@ -2,70 +2,77 @@
 
 from __future__ import annotations
 
-from collections import deque
-from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from trainctl.signals import Bools, Floats, Links
+from trainctl.signals import Bools, Floats, Links, Messages
 from trainctl.topology.graph import reach
 
 #: Stream of the run's seed that decides which messages are lost.
 LOSS_STREAM = 1
 
 
-@dataclass
-class Exchange:
-    """The air: what was sent, and what each link brought last.
-
-    ``delay`` counts exchange periods. Messages are in a frame that moves with the reference, so old ones do not lag behind.
-    """
+class Radio(NamedTuple):
+    """How messages travel. They are in a frame that moves with the reference, so old ones do not lag behind."""
 
     loss: float
-    delay: int
+    delay: int  # exchange periods
     radius: float
     seed: int
-    sent: deque[Floats] = field(default_factory=deque)
-    heard: Floats = field(default_factory=lambda: np.zeros((0, 0)))
-    ever: Bools = field(default_factory=lambda: np.zeros(0, bool))
 
-    def copy(self) -> Exchange:
-        """The same at this moment, to come back to."""
-        return replace(self, sent=self.sent.copy(), heard=self.heard.copy(), ever=self.ever.copy())
 
-    @property
-    def perfect(self) -> bool:
-        """Nothing is ever lost, late or out of reach."""
-        return self.loss == 0.0 and self.delay == 0 and np.isinf(self.radius)
+def silent() -> Messages:
+    """Nothing sent, nothing received."""
+    return Messages((), np.zeros((0, 0)), np.zeros(0, bool))
 
-    def relink(self, before: Links | None, now: Links) -> None:
-        """Carry what old links brought over to the new edge list; a new link has brought nothing yet."""
-        heard, ever = np.zeros((len(now.sender), self.heard.shape[1])), np.zeros(len(now.sender), bool)
-        if before is not None:
-            old, new = (k.sender * len(k.slot) + k.receiver for k in (before, now))
-            _, was, row = np.intersect1d(old, new, assume_unique=True, return_indices=True)
-            heard[row], ever[row] = self.heard[was], self.ever[was]
-        self.heard, self.ever = heard, ever
 
-    def deliver(self, sent: Floats, position: Floats, links: Links, count: int) -> Bools:
-        """Send what every train says, ``sent`` (n, w), as exchange number ``count``; returns which links heard, shape (L,).
+def relinked(messages: Messages, before: Links | None, now: Links) -> Messages:
+    """Carry what old links brought over to the new edge list; a new link has brought nothing yet."""
+    heard, ever = np.zeros((len(now.sender), messages.heard.shape[1])), np.zeros(len(now.sender), bool)
+    if before is not None:
+        old, new = (k.sender * len(k.slot) + k.receiver for k in (before, now))
+        _, was, row = np.intersect1d(old, new, assume_unique=True, return_indices=True)
+        heard[row], ever[row] = messages.heard[was], messages.ever[was]
+    return messages._replace(heard=heard, ever=ever)
 
-        ``self.heard`` (L, w) then holds what each link brought last. Losses are a function of (seed, count) alone.
-        """
-        if self.heard.shape != (len(links.sender), sent.shape[1]):  # the first message tells its width
-            self.heard = np.zeros((len(links.sender), sent.shape[1]))
-        if len(self.ever) != len(links.sender):
-            self.ever = np.zeros(len(links.sender), bool)
-        self.sent.append(sent)
-        if len(self.sent) > self.delay + 1:
-            self.sent.popleft()
-        if len(self.sent) <= self.delay:
-            return np.zeros(len(links.sender), bool)  # the first messages are still under way
-        arrives = np.ones(len(links.sender), bool)
-        if np.isfinite(self.radius):
-            arrives &= reach(position, links, self.radius)
-        if self.loss > 0.0:
-            arrives &= np.random.default_rng([self.seed, LOSS_STREAM, count]).random(len(arrives)) >= self.loss
-        np.copyto(self.heard, self.sent[0][links.sender], where=arrives[:, None])
-        self.ever |= arrives
-        return arrives
+
+def deliver(radio: Radio, messages: Messages, sent: Floats, position: Floats, links: Links, count: int) -> tuple[Messages, Bools]:
+    """Send what every train says as one exchange.
+
+    Parameters
+    ----------
+    radio : Radio
+        How messages travel.
+    messages : Messages
+        Before; left as it is.
+    sent : ndarray, shape (n, w)
+        What every train says.
+    position : ndarray, shape (n,)
+        Where every train believes to be [m].
+    links : Links
+        Who hears whom.
+    count : int
+        Number of the exchange: losses are a function of seed and count alone.
+
+    Returns
+    -------
+    Messages
+        ``heard`` (L, w) holds what each link brought last.
+    ndarray of bool, shape (L,)
+        Which links heard now.
+    """
+    rows = len(links.sender)
+    # the first message tells its width
+    heard = messages.heard.copy() if messages.heard.shape == (rows, sent.shape[1]) else np.zeros((rows, sent.shape[1]))
+    ever = messages.ever if len(messages.ever) == rows else np.zeros(rows, bool)
+    under_way = (*messages.sent, sent)[-radio.delay - 1 :]
+    if len(under_way) <= radio.delay:
+        return Messages(under_way, heard, ever), np.zeros(rows, bool)  # the first messages are still under way
+    arrives = np.ones(rows, bool)
+    if np.isfinite(radio.radius):
+        arrives &= reach(position, links, radio.radius)
+    if radio.loss > 0.0:
+        arrives &= np.random.default_rng([radio.seed, LOSS_STREAM, count]).random(rows) >= radio.loss
+    np.copyto(heard, under_way[0][links.sender], where=arrives[:, None])
+    return Messages(under_way, heard, ever | arrives), arrives

@@ -1,0 +1,74 @@
+"""The railway without a simulator: plain arithmetic on the same routes (``--backend numeric``)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sumo_net import Line
+from trainctl.railway.ways import Ways, rerouted, ways
+from trainctl.signals import Floats, Ints, Links, Seen, Start
+
+
+def lay_out(line: Line, start: Start) -> Ways:
+    """The ways of trains that start."""
+    return ways([[line.index[e] for e in route] for route in start.routes], line.start_m, line.length_m)
+
+
+class Numeric:
+    """The line without a simulator: trains follow their ways by addition, and leave at the end."""
+
+    def __init__(self, line: Line) -> None:
+        self.line = line
+
+    def start(self, start: Start) -> None:
+        """Put the trains on the line."""
+        self.ways = lay_out(self.line, start)
+        self.row = self.ways.first[:-1].copy()
+        self.lane_position = start.lane_position.copy()
+        self.present = start.present.copy()
+        self.coming: list[int] = []
+
+    def measure(self) -> Seen:
+        """Where every train is now."""
+        edge = self.ways.edge[self.row]
+        return Seen(self.ways.begin[self.row] + self.lane_position, edge, self.row.copy(), self.present.copy())
+
+    def route(self, train: int, edges: tuple[str, ...]) -> None:
+        """Give a train another route."""
+        line, row = self.line, int(self.row[train])
+        before = self.ways.first
+        self.ways = rerouted(self.ways, train, row, [line.index[e] for e in edges], line.start_m, line.length_m)
+        self.row += self.ways.first[:-1] - before[:-1]
+
+    def insert(self, train: int, speed: float) -> None:
+        """Put a train on the net."""
+        self.coming.append(train)
+
+    def linked(self, links: Links, formation: Ints) -> None:
+        """Nobody looks."""
+
+    def move(self, displacement: Floats, step: float) -> None:
+        """Move every train; as in SUMO a train on the very end of an edge is still on it."""
+        self.lane_position += np.where(self.present, displacement, 0.0)
+        edge, length = self.ways.edge, self.line.length_m
+        for i in np.flatnonzero(self.lane_position > length[edge[self.row]]).tolist():
+            last = int(self.ways.first[i + 1]) - 1
+            while self.lane_position[i] > length[edge[self.row[i]]] and self.row[i] < last:
+                self.lane_position[i] -= length[edge[self.row[i]]]
+                self.row[i] += 1
+            self.present[i] = self.lane_position[i] <= length[edge[self.row[i]]]
+        self.present[self.coming] = True
+        self.coming.clear()
+
+    def close(self) -> None:
+        """Nothing to end."""
+
+    def messages(self) -> list[tuple[float | None, str]]:
+        """None."""
+        return []
+
+    def collisions(self) -> list[dict[str, Any]]:
+        """None."""
+        return []

@@ -1,0 +1,260 @@
+"""Who comes, stops and leaves; whose turn it is at switches and on single track; what is ahead of every train."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from trainctl.monitors import waiting
+from trainctl.railway import along, authority, interlocking, supervisor
+from trainctl.railway.authority import DRIVER_MARGIN_M, View
+from trainctl.railway.interlocking import Held
+from trainctl.railway.ways import Ways
+from trainctl.scenario.build import Prepared
+from trainctl.scenario.roster import Stop
+from trainctl.signals import Bools, Floats, Ints, Seen
+from trainctl.stages.record import Journal
+
+#: A train that is slower and nearer to its stop than this has reached it [m/s], [m].
+STANDS_MPS, STOP_BAND_M = 0.05, 2.0
+
+#: A train enters if it can do so with this share of its speed.
+ENTERS_WITH = 0.8
+
+#: Trains that must slow down, stop or wait within this time do not couple before [s].
+SOON_S = 60.0
+
+
+class State(NamedTuple):
+    """What the traffic has come to, shape (n,)."""
+
+    came: Bools
+    left: Bools
+    next_stop: Ints  # number of it in the roster
+    stands_until: Floats  # s, while a train stands at a stop, else NaN
+    stopping: Bools  # for its next stop
+    waits_for: Ints  # train that each is held by at a switch, -1 if none
+    claims: interlocking.State
+
+    @property
+    def standing(self) -> Bools:
+        """Trains that stand at a stop."""
+        stands: Bools = ~np.isnan(self.stands_until)
+        return stands
+
+
+class Around(NamedTuple):
+    """What this instant's traffic means to the trains."""
+
+    entries: tuple[tuple[int, float], ...]  # trains that come now, with their speeds [m/s]
+    stops: tuple[Ints, Floats]  # trains with a stop ahead, and the room to it [m]
+    soon: Bools  # (n,) they stop soon
+    held: Held | None  # how far each may go before a place that is another's; None: nobody asks
+    kept_out: dict[int, int]  # trains that are due and cannot enter: because of whom
+    view: View | None  # None: nobody asks
+
+
+def nothing(trains: int) -> Around:
+    """Nobody comes, stops, waits or looks ahead."""
+    return Around((), (np.zeros(0, np.int64), np.zeros(0)), np.zeros(trains, bool), None, {}, None)
+
+
+class Traffic:
+    """The traffic of a run."""
+
+    def __init__(self, p: Prepared, journal: Journal) -> None:
+        self.p, self.journal, self.roster = p, journal, p.roster
+        self.rules, self.assumed = p.driver_rules, p.relied_on_by_driver
+        self.step_s, self.theta = p.scenario.run.step_s, p.step_theta
+        self.net, self.length = along.net(p.rails), p.consists.train_length()
+        self.stops_of = np.array([len(stops) for stops in p.roster.stops], np.int64)
+        self.looks = p.supervision.mode != "off" or not p.placed
+        planned = min(
+            p.supervision.emergency_mps2, p.supervision.service_mps2, *([] if p.placed else [p.driving.deceleration_mps2])
+        )
+        self.claiming = np.minimum(p.assumed.braking, planned)  # what is claimed for, and braked with at least
+        self.ways: Ways | None = None
+
+    def initial(self) -> State:
+        """Before the run: trains that are placed have come."""
+        n = len(self.length)
+        return State(
+            came=np.full(n, self.p.placed), left=np.zeros(n, bool), next_stop=np.zeros(n, np.int64),
+            stands_until=np.full(n, np.nan), stopping=np.zeros(n, bool), waits_for=np.full(n, -1), claims=interlocking.none(),
+        )  # fmt: skip
+
+    def step(self, t: float, ways: Ways, seen: Seen, speed: Floats, overrun: Floats, s: State) -> tuple[State, Around]:
+        """Arrivals, stops, entries; ``overrun`` (n,) is how much farther trains run than their brakes promise [m].
+
+        ``speed`` (n,) gets the speeds of trains that enter.
+        """
+        s = self.arrivals(t, seen, s)
+        if not self.looks:
+            return s, nothing(len(speed))
+        s, stops, soon = self._stops(t, seen, speed, overrun, s)
+        s, held, entries, kept_out = self.entering(t, ways, seen, speed, s)
+        present = seen.present.copy()
+        present[[i for i, _ in entries]] = True
+        view = self._look(ways, seen._replace(present=present), speed, held, s)
+        return s, Around(entries, stops, soon, held, kept_out, view)
+
+    # Arrivals and entries
+
+    def arrivals(self, t: float, seen: Seen, s: State) -> State:
+        """Trains that have left at the end of their ways."""
+        gone = s.came & ~seen.present & ~s.left
+        if not gone.any():
+            return s
+        for i in np.flatnonzero(gone).tolist():
+            self.journal.event(t, "arrive", train=self.p.scenario.ids[i])
+        return s._replace(left=s.left | gone)
+
+    def due(self, t: float, s: State) -> list[int]:
+        """Trains that are to come now: of each edge the first that waits there."""
+        first: dict[int, int] = {}
+        for i in np.flatnonzero(~s.came & (self.roster.depart <= t + 1e-9)).tolist():
+            first.setdefault(int(self.roster.edge[i]), i)
+        return sorted(first.values(), key=lambda i: (self.roster.depart[i], i))
+
+    def missing(self, t: float, s: State) -> list[str]:
+        """Trains that were due and never came."""
+        late = np.flatnonzero(~s.came & (self.roster.depart <= t + 1e-9)).tolist()
+        return [self.p.scenario.ids[i] for i in late]
+
+    def entering(
+        self, t: float, ways: Ways, here: Seen, speed: Floats, s: State
+    ) -> tuple[State, Held, tuple[tuple[int, float], ...], dict[int, int]]:
+        """Trains whose time has come and whose place is clear, with the speed they come with [m/s]; who keeps out the others."""
+        due = self.due(t, s)
+        asking = np.zeros(len(speed), bool)
+        asking[due] = True
+        s, held = self._claim(t, ways, here, speed, asking, s)
+        present, came, come, kept_out = here.present.copy(), s.came.copy(), [], {}
+        for i in due:
+            if held.room[i] <= 0.0:
+                continue
+            present[i] = True
+            view = self._look(ways, here._replace(present=present), speed, held, s)
+            v = self._entering_speed(i, speed, view, s)
+            present[i] = v is not None
+            if v is None:
+                kept_out[i] = waiting.kept_out(view, i)
+                continue
+            came[i], speed[i] = True, v
+            planned = float(self.roster.depart[i])
+            self.journal.event(t, "depart", train=self.p.scenario.ids[i], planned_s=planned, delay_s=t - planned, speed_mps=v)
+            come.append((i, v))
+        return s._replace(came=came), held, tuple(come), kept_out
+
+    def _entering_speed(self, i: int, speed: Floats, view: View, s: State) -> float | None:
+        """Speed with which a train can enter safely; None if it has to wait. ``view`` is that with the train at its place."""
+        rules, v, roster = self.rules, self.roster.speed[i], self.roster
+        limit = float(roster.speed_factor[i] * self.p.rails.speed_mps[roster.edge[i]])
+        on_edge = limit - self.p.driving.below_limit_mps
+        wanted = float(min(self.p.cruise[i], max(on_edge, 0.0)) if np.isnan(v) else min(v, limit))
+        if (stop := self.stop_of(i, s)) is not None:  # it must be able to stop there
+            place = stop.place - float(self.p.rails.start_m[roster.edge[i]]) - float(roster.lane_position[i])
+            room = np.array([place - wanted * self.step_s])
+            planned = float(min(rules.service_mps2, self.assumed.braking[i]))
+            wanted = min(wanted, float(supervisor.greatest_speed(room, planned, self.step_s, self.theta)[0]))
+        ahead = authority.of(view.targets, view.targets.train == i)
+        stands = np.where(np.arange(len(speed)) == i, 0.0, speed)
+        _, safe = supervisor.too_late(rules, self.assumed, stands, ahead, self.step_s, self.theta)
+        entry = float(min(wanted, *safe.tolist(), np.inf))
+        if np.any(ahead.room < rules.margin_m) or entry < (wanted - 1e-9 if not np.isnan(v) else ENTERS_WITH * wanted):
+            return None
+        other = int(view.ahead.train[i])
+        if other >= 0 and roster.cooperates[[i, other]].all() and view.ahead.spacing[i] < self.p.spacing.desired - 1.0:
+            return None
+        trial = speed.copy()
+        trial[i] = entry
+        behind = view.targets.other == i
+        if behind.any():
+            asked = authority.of(view.targets, behind)
+            seen = supervisor.verdict(
+                rules, trial, asked, supervisor.no_limits(), self.step_s, self.theta, self.assumed, np.zeros(len(speed))
+            )
+            if np.any(seen.emergency[view.targets.train[behind]]):
+                return None
+        return entry
+
+    # Stops
+
+    def stop_of(self, i: int, s: State) -> Stop | None:
+        """The next stop of a train."""
+        stops, k = self.roster.stops[i], int(s.next_stop[i])
+        return stops[k] if k < len(stops) else None
+
+    def _stops(self, t: float, seen: Seen, speed: Floats, overrun: Floats, s: State) -> tuple[State, tuple[Ints, Floats], Bools]:
+        """Arrive at and leave stops; the trains that have one ahead and the room to it [m], and who stops soon."""
+        trains, rooms, n = [], [], len(speed)
+        standing = s.standing
+        s = s._replace(next_stop=s.next_stop.copy(), stands_until=s.stands_until.copy(), stopping=s.stopping.copy())
+        for i in np.flatnonzero(seen.present & (s.next_stop < self.stops_of)).tolist():
+            stop = self.stop_of(i, s)
+            assert stop is not None
+            room = stop.place - float(seen.position[i])
+            if standing[i]:
+                if t < s.stands_until[i] - 1e-9:
+                    continue
+                s.stands_until[i] = np.nan
+                s.next_stop[i] += 1
+                self.journal.event(t, "stop_left", train=self.p.scenario.ids[i], stop=stop.name)
+                stop = self.stop_of(i, s)
+                if stop is None:
+                    s.stopping[i] = False
+                    continue
+                room = stop.place - float(seen.position[i])
+            if speed[i] < STANDS_MPS and room < STOP_BAND_M:
+                s.stands_until[i] = max(t + stop.duration, stop.until)
+                self.journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=room)
+                continue
+            trains.append(i)
+            rooms.append(max(room - float(overrun[i]), 0.0))
+        found, room_to = np.array(trains, np.int64), np.array(rooms)
+        rate = np.minimum(self.rules.service_mps2, self.assumed.braking[found])
+        braking = supervisor.stopping_distance(speed[found], rate, self.step_s, self.theta)
+        near, soon = np.zeros(n, bool), np.zeros(n, bool)
+        near[found] = room_to < braking + 10.0 * self.step_s * speed[found] + 50.0
+        soon[found] = room_to < braking + SOON_S * speed[found]
+        stopping = (s.stopping & seen.present | near) & (near | s.standing)
+        return s._replace(stopping=stopping), (found, room_to), soon | near
+
+    # Turns, and what is ahead
+
+    def _reach(self, speed: Floats) -> Floats:
+        """How far ahead every train claims [m]: farther than it would brake for what it must not enter."""
+        assumed, rules = self.p.assumed, self.p.supervision
+        v = np.maximum(speed, 0.0) + assumed.drift + 2.0 * assumed.lag * rules.emergency_mps2
+        braking = supervisor.stopping_distance(v, self.claiming, self.step_s, self.theta)
+        return braking + 4.0 * v * self.step_s + rules.margin_m + 2.0 * DRIVER_MARGIN_M + 50.0 + 6.0 * assumed.uncertainty
+
+    def _claim(self, t: float, ways: Ways, seen: Seen, speed: Floats, entering: Bools, s: State) -> tuple[State, Held]:
+        """Let every train claim what lies within its reach; ``entering`` (n,) are those that ask to enter the net."""
+        if self.ways is not ways:  # they changed
+            self.ways, self.zones = ways, interlocking.zones(ways, self.net)
+        claims, held, said = interlocking.claim(
+            self.zones, s.claims, seen.row, seen.position, self.length, seen.present, self._reach(speed),
+            self.p.supervision.margin_m + DRIVER_MARGIN_M, entering,
+        )  # fmt: skip
+        ids, edges = self.p.scenario.ids, self.p.rails.edges
+        for one in said:
+            if one.by >= 0:
+                self.journal.event(
+                    t, "conflict", train=ids[one.train], first=ids[one.by], edge=edges[one.zone],
+                    place="join" if one.join else "single_track",
+                )  # fmt: skip
+            elif one.granted and not one.join and s.waits_for[one.train] >= 0:
+                self.journal.event(t, "switch_granted", train=ids[one.train], edge=edges[one.zone])
+        return s._replace(claims=claims, waits_for=held.by.copy()), held
+
+    def _look(self, ways: Ways, seen: Seen, speed: Floats, held: Held, s: State) -> View:
+        """What is ahead of every train."""
+        horizon = float(np.max(self._reach(speed), where=seen.present, initial=0.0)) + 1000.0
+        if not self.p.placed:
+            horizon = max(horizon, self.p.driving.join_range_m)
+        return authority.look(
+            ways, self.net, self.p.rails.speed_mps, self.roster.speed_factor, seen.row, seen.position, speed, self.length,
+            seen.present, horizon, held.room, interlocking.order(s.claims),
+        )  # fmt: skip
