@@ -176,6 +176,9 @@ class Alarms:
         if service is not None or rules.mode == "on":  # otherwise nothing keeps a train from going on
             found = waiting.waits(view, held, here, speed, rules, p.scenario.run.step_s, p.step_theta, own_stop)
         if service is not None:
+            known = {w.train for w in found}
+            stand = np.flatnonzero(waiting.standing(here, speed, own_stop)).tolist()
+            found += [Wait(i, -1, int(here.edge[i]), None) for i in stand if i not in known]  # its driver would start it
             entries = waiting.entries(service, t, held, out)
             due = {w.train: float(service.roster.depart[w.train]) for w in entries}
             found += entries
