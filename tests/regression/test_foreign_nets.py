@@ -35,7 +35,7 @@ def unharmed(run: Run, arrive: bool = True) -> None:
     sumo = run.folder / "sumo"
     assert "<collision " not in (sumo / "collisions.xml").read_text()
     assert 'teleports total="0"' in (sumo / "statistics.xml").read_text()
-    assert [e for e in run.events if e["kind"] in ("sumo_warning", "violation")] == []
+    assert [e for e in run.events if e["kind"] in ("sumo_warning", "violation", "gridlock")] == []
     assert [e for e in run.events if e["kind"] == "supervisor" and (e["emergency"] or e["reason"] != "limit")] == []
     if arrive:
         trains = {e["train"] for e in run.events if e["kind"] == "depart"}
@@ -286,6 +286,6 @@ def test_nets_drawn_at_random(tmp_path, law, seed):
     nets.at_random(tmp_path, seed)
     found = go(tmp_path, nets.scenario(law, 3600))
     assert "<collision " not in (found.folder / "sumo" / "collisions.xml").read_text()
-    assert [e for e in found.events if e["kind"] in ("sumo_warning", "violation")] == []
+    assert [e for e in found.events if e["kind"] in ("sumo_warning", "violation", "gridlock")] == []
     assert [e for e in found.events if e["kind"] == "supervisor" and e["emergency"]] == []
     assert len([e for e in found.events if e["kind"] == "arrive"]) == len(found.trains.train.unique())

@@ -165,7 +165,10 @@ def test_the_baseline_fails_too(tmp_path, typed):
     assert code == 1, said
     done = Run(out)
     assert done.collisions == 1 == done.metrics["traffic.collisions"]
-    assert [e["trains"] for e in done.events if e["kind"] == "violation" and "trains" in e] == [["1", "2"]]
+    told = [(e["bound"], e["trains"]) for e in done.events if e["kind"] == "violation" and "trains" in e]
+    assert told == [("gap_m", ["1", "2"])]  # ours, at the time and place SUMO counts
+    (counted,) = collisions(out / "sumo" / "collisions.xml", {"1", "2"})
+    assert violations(done, "gap_m")[0]["time_s"] == counted["time_s"]
 
 
 def test_in_a_sweep_a_collision_is_a_result(tmp_path):

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
-import pytest
+from types import SimpleNamespace
 
+import numpy as np
+import pytest
+from trainctl.supervisor import Targets
+
+from trainctl import supervisor
+from trainctl.monitors import waiting
 from trainctl.monitors.outcome import Tally
 from trainctl.monitors.waiting import SWITCH, TRAIN, Wait, Waiting, circles
+from trainctl.world import Seen
 
 
 def waits(*pairs):
@@ -27,6 +34,26 @@ def waits(*pairs):
 )
 def test_circles(pairs, expected):
     assert circles(waits(*pairs)) == expected
+
+
+def test_what_keeps_a_train_from_starting():
+    """Train 0 is held at a switch by 1, which stands behind 2; 2 has 500 m before it and goes; 3 stands at its stop behind 0."""
+    train, room, other = [0, 1, 2, 3], [25.0, 20.0, 500.0, 20.0], [-1, 2, 0, 0]
+    kind = np.where(np.array(other) < 0, supervisor.SWITCH, supervisor.TRAIN)
+    targets = Targets(np.array(train), np.array(room), np.zeros(4), kind == supervisor.TRAIN, kind, np.array(other))
+    view, held = (
+        SimpleNamespace(targets=targets, clear=targets),
+        SimpleNamespace(by=np.array([1, -1, -1, -1]), zone=np.array([7, -1, -1, -1])),
+    )
+    here = Seen(np.zeros(4), np.array([5, 5, 6, 5]), np.arange(4), np.ones(4, bool))
+    rules, stops = supervisor.Params(mode="on", margin_m=30.0), np.array([False, False, False, True])
+
+    def found(speed):
+        return waiting.waits(view, held, here, np.array(speed), rules, 1.0, 0.5, stops)
+
+    assert found([0.0, 0.0, 0.0, 0.0]) == [Wait(1, 2, 6, TRAIN), Wait(0, 1, 7, SWITCH)]
+    assert found([3.0, 0.0, 0.0, 0.0]) == [Wait(1, 2, 6, TRAIN)]
+    assert found([3.0, 1.0, 5.0, 0.0]) == []
 
 
 def test_a_circle_is_told_once_and_another_one_too():

@@ -181,6 +181,10 @@ class Alarms:
             found = waiting.waits(
                 around.view, around.held, here, speed, rules, assumed, p.scenario.run.step_s, p.step_theta, traffic.standing
             )
+        if not p.placed:  # those whom nothing keeps that is known: their driver would start them
+            known = {w.train for w in found}
+            stand = np.flatnonzero(waiting.standing(here, speed, traffic.standing)).tolist()
+            found += [Wait(i, -1, int(here.edge[i]), None) for i in stand if i not in known]
         entries = waiting.entries(p.roster, traffic.came, due, t, around.held, around.kept_out)
         since = {w.train: float(p.roster.depart[w.train]) for w in entries}
         yield from self.waiting.new(t, found + entries, since, s.waiting)

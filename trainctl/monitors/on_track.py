@@ -14,6 +14,7 @@ from numba import njit
 
 from sumo_net import Line, Rails
 from trainctl.kernels import keep_by_sources
+from trainctl.monitors.outcome import GAP, LIMIT
 from trainctl.railway.ways import Ways
 from trainctl.signals import Bools, Floats, Ints
 
@@ -25,9 +26,6 @@ keep_by_sources()  # before anything below is decorated
 
 #: Rounding of positions on a line of some hundred kilometres, as SUMO hands them back.
 ROUNDING = 1e-6
-
-#: Bounds of what is watched here, as events name them: room to the train ahead, and the speed limit of the track.
-GAP, LIMIT = "gap_m", "line_speed_mps"
 
 
 class Track(NamedTuple):

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-from trainctl.monitors.on_track import GAP, LIMIT
-
-#: Bound of a collision that SUMO counted and we did not.
-COUNTED = "sumo_collision"
+#: Bounds as events name them: room to the train ahead; the line's speed limit; a collision that SUMO counted and we did not.
+GAP, LIMIT, COUNTED = "gap_m", "line_speed_mps", "sumo_collision"
 
 
 class Tally(NamedTuple):

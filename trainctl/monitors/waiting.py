@@ -34,7 +34,13 @@ class Wait(NamedTuple):
     train: int
     other: int  # whose it is, -1: nobody's that is known
     edge: int  # where the other one stands, or the edge that must not be entered; -1: not known
-    place: str | None
+    place: str | None  # None: it stands, and nothing that is known keeps it
+
+
+def standing(here: Seen, speed: Floats, own_stop: Bools) -> Bools:
+    """Trains (n,) on the net that stand, but not at their own stops."""
+    stand: Bools = here.present & ~own_stop & (np.abs(speed) < STANDS_MPS)
+    return stand
 
 
 def waits(
@@ -60,7 +66,7 @@ def waits(
     own_stop : ndarray, shape (n,)
         Trains that stand at their own stops: they wait for nobody.
     """
-    stand = here.present & ~own_stop & (np.abs(speed) < STANDS_MPS)
+    stand = standing(here, speed, own_stop)
     if not stand.any():
         return []
     found, none = [], np.zeros_like(speed)

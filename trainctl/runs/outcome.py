@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-from trainctl.monitors.on_track import GAP, LIMIT
-from trainctl.monitors.outcome import COUNTED
+from trainctl.monitors.outcome import COUNTED, GAP, LIMIT
 from trainctl.runs.run import Run
 
 
