@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from trainctl.topology import along, claims
+from trainctl.topology import bodies as in_the_way
 from trainctl.topology.ways import ways as laid
 
 BRAKING = 0.8  # m/s2
@@ -225,7 +226,7 @@ def drive(net_of, routes, seed, n, limit=9000):
         reach = v**2 / (2 * BRAKING) + 3 * v + 2 * MARGIN
         state, held, _ = claims.claim(zones, state, row, s, length, present, reach, 2 * MARGIN)
         here = along.places(ways, net, row, s, length, present, 3000.0, claims.order(state))
-        room = np.minimum(along.obstacles(here, virtual=False).room, held.room) - MARGIN
+        room = np.minimum(in_the_way.obstacles(here, virtual=False).room, held.room) - MARGIN
         wanted = np.minimum(v + acceleration, top)
         stops = -BRAKING + np.sqrt(BRAKING**2 + 2 * BRAKING * np.maximum(room, 0.0))  # v^2 / 2b + v <= room
         v = np.where(present, np.minimum(wanted, stops), 0.0)
