@@ -12,7 +12,7 @@ from trainctl.signals import Bools, Floats, Ints
 from trainctl.supervisor import LIMIT, OPPOSING, SWITCH, TRAIN, Limits, Params, Targets, Verdict, verdict
 from trainctl.topology import along
 from trainctl.topology.along import Ahead
-from trainctl.topology.bodies import Bodies, bodies
+from trainctl.topology.bodies import Bodies, bodies, fouling
 from trainctl.topology.ways import Ways
 
 keep_by_sources()  # before anything below is decorated
@@ -27,6 +27,7 @@ class View(NamedTuple):
     limits: Limits
     room: Floats  # (n,) m, to the body on the own way that surely is there; inf: none
     body: Ints  # (n,) whose it is, -1: none
+    fouling: Bools  # (n,) its tail lies on another train behind the beginning of its way, see ``topology.bodies``
 
 
 def look(
@@ -68,7 +69,7 @@ def look(
     real = far_first[(there.sense[far_first] != 0) & there.sure[far_first]]
     room[there.train[real]], body[there.train[real]] = there.room[real], there.other[real]  # the nearest is written last
     limits = Limits(*_limits(ways, limit, factor, row, s, length, present, horizon))
-    return View(along.ahead(placed), targets, clear, limits, room, body)
+    return View(along.ahead(placed), targets, clear, limits, room, body, fouling(placed))
 
 
 def _targets(body: Bodies, held: Floats, speed: Floats, present: Bools) -> Targets:

@@ -158,7 +158,7 @@ class Service:
         other = int(view.ahead.train[i])
         if other >= 0 and self.roster.cooperates[[i, other]].all() and view.ahead.spacing[i] < self.spacing.desired - 1.0:
             return None
-        if np.any(view.clear.room[view.clear.other == i] < 0.0):  # one that stands would be under it
+        if view.fouling[i] or np.any(view.clear.room[view.clear.other == i] < 0.0):  # another would be under it, or its tail
             return None
         trial = speed.copy()
         trial[i] = entry

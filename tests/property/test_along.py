@@ -252,6 +252,21 @@ def test_no_track_that_a_train_occupies_is_nearer_than_what_is_told(tree, seed, 
                 break
 
 
+@settings(max_examples=150, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(2, 9))
+def test_tails_behind_the_beginning_foul_what_they_would_lie_on_and_across(seed, n):
+    rng = np.random.default_rng(seed)
+    railway = random_railway(rng, False)
+    traffic, _ = random_traffic(rng, railway, n)
+    found = in_the_way.fouling(along.places(traffic[0], along.net(railway), *traffic[1:], 100.0))
+    for i in range(n):
+        tail = [(e, max(depth - traffic[3][i], 0.0)) for e, depth, k, _ in bodies(railway, traffic, i) if k < 0]
+        others = [piece for j in set(range(n)) - {i} for piece in occupied(railway, traffic, j)]
+        across = {e for j in set(range(n)) - {i} for f, *_ in bodies(railway, traffic, j) for e in railway.crossing[f]}
+        lies_on = any(e == f and b > rear and a < railway.length_m[e] for e, rear in tail for f, a, b in others)
+        assert found[i] == (lies_on or any(e in across for e, _ in tail))
+
+
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(2, 12))
 def test_on_a_tree_of_merges_trains_on_the_way_to_one_edge_are_one_chain(seed, n):

@@ -79,6 +79,71 @@ def test_a_body_on_the_twin_comes_the_other_way_and_one_across_blocks_the_edge()
     assert both_in.room.tolist() == [-5.0, np.inf]  # the one that is deeper in goes on
 
 
+def test_a_tail_behind_the_beginning_of_a_way_lies_on_the_edges_that_lead_there():
+    follower, reaches_back = ((A, M, L), 1, 1000, 100), ((L,), 0, 50, 300)
+    found = in_the_way.bodies(seen(FORK, [follower, reaches_back]), virtual=False)
+    assert (found.train.tolist(), found.other.tolist(), found.room.tolist()) == ([0], [1], [2000 - 250 - 1000])
+    assert (found.sense.tolist(), found.sure.tolist()) == ([1], [True])
+    # Two lead to m: it may lie on a or on b, and counts on both.
+    both = in_the_way.bodies(seen(FORK, [((A, M), 0, 400, 100), ((B, M), 0, 400, 100), ((M, L), 0, 50, 300)]), virtual=False)
+    rows = list(zip(both.train.tolist(), both.other.tolist(), both.room.tolist(), both.sure.tolist(), strict=True))
+    assert (0, 2, 1000 - 250 - 400, False) in rows
+    assert (1, 2, 1200 - 250 - 400, False) in rows
+    assert in_the_way.obstacles(seen(FORK, [((M, R), 0, 1500, 100), ((L,), 0, 50, 700)])).room[0] == 2000 - 650 - 1500
+    longer = [((B, M), 0, 1100, 100), ((L,), 0, 50, 2200)]  # over m and back onto a or b
+    assert in_the_way.obstacles(seen(FORK, longer)).room[0] == 1200 + 2000 + 50 - 2200 - 1100
+
+
+def test_a_tail_behind_the_beginning_stands_in_the_way_of_those_who_come_and_who_cross():
+    # 0 leads to 1, 3 is the other direction of 0, 4 crosses 0.
+    net = SimpleNamespace(
+        length_m=np.array([500.0, 400.0, 100.0, 500.0, 30.0]), before=[[], [0], [], [2], [2]], twin=np.array([3, -1, -1, 0, -1]),
+        crossing=[[4], [], [], [], [0]],
+    )  # fmt: skip
+    hanging = ((1,), 0, 50, 300)
+    found = in_the_way.bodies(seen(net, [((2, 3), 0, 80, 50), ((2, 4), 0, 30, 20), hanging]), virtual=False)
+    assert found.train.tolist() == [0, 1, 1]
+    assert (found.room[[0, 2]].tolist(), found.other[[0, 2]].tolist(), found.sense[[0, 2]].tolist()) == (
+        [20.0, 70.0],
+        [2, 2],
+        [-1, 0],
+    )
+
+
+def test_at_a_join_one_who_passes_after_the_train_ahead_is_told_and_one_who_passes_before_it_is_not():
+    trains = [((A, M, L), 0, 400, 100), ((A, M, L), 0, 700, 100), ((B, M, R), 0, 500, 100)]
+
+    def told(*turns):
+        order = along.Order(np.full(3, M), np.array(turns), np.arange(3))
+        found = in_the_way.bodies(seen(FORK, trains, order=order), virtual=False)
+        return {i: sorted(found.other[found.train == i].tolist()) for i in range(3)}
+
+    assert told(1, 2, 0) == {0: [1, 2], 1: [], 2: [1]}
+    assert told(2, 1, 0) == {0: [1], 1: [2], 2: []}
+
+
+def test_a_decided_turn_counts_also_where_one_stands_on_the_way_of_the_other():
+    # Two tracks, 1 and 2, from 0 to 3: the first train takes the longer and is to let the second pass.
+    net = SimpleNamespace(
+        length_m=np.array([2000.0, 500.0, 600.0, 900.0]), before=[[], [0], [0], [1, 2]], twin=np.full(4, -1), crossing=[[]] * 4
+    )
+    trains, order = [((0, 2, 3), 0, 1900, 100), ((0, 1, 3), 0, 1000, 100)], along.Order(*np.array([[3, 1, 0], [3, 0, 1]]).T.copy())
+    found = in_the_way.bodies(seen(net, trains, order=order), virtual=False)
+    assert found.room[found.train == 0].tolist() == [700.0]
+    assert np.isinf(in_the_way.obstacles(seen(net, trains), virtual=False).room[0])
+
+
+def test_what_lies_across_a_track_the_train_ahead_is_over_is_told():
+    net = SimpleNamespace(
+        length_m=np.array([500.0, 30.0, 900.0, 30.0]), before=[[], [0], [1], []], twin=np.full(4, -1), crossing=[[], [3], [], [1]]
+    )
+    way = (0, 1, 2)
+    found = in_the_way.bodies(seen(net, [(way, 0, 100, 50), (way, 2, 20, 90), ((3,), 0, 5, 50)]), virtual=False)
+    assert sorted(found.other[found.train == 0].tolist()) == [1, 2]
+    beyond = in_the_way.bodies(seen(net, [(way, 0, 100, 50), (way, 0, 300, 90), ((3,), 0, 5, 50)]), virtual=False)
+    assert beyond.other[beyond.train == 0].tolist() == [1]
+
+
 def test_beyond_the_horizon_there_is_nothing():
     trains = [((A, M), 0, 0, 100), ((A, M), 1, 500, 100), ((B, M), 0, 300, 100)]
     assert along.ahead(seen(FORK, trains, 1500.0)).train.tolist() == [2, -1, 1]

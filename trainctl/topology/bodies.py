@@ -87,6 +87,31 @@ def obstacles(places: Places, virtual: bool = True) -> Obstacles:
     return Obstacles(room, train, sense)
 
 
+def fouling(places: Places) -> Bools:
+    """Whether the tail of each train lies, or may lie, on another or across its track, behind the beginning of its way; (n,).
+
+    Nobody comes up to such a tail: its train was put there. So it is to be asked before a train is.
+    """
+    found = np.zeros(len(places.row), bool)
+    for p in np.flatnonzero(places.piece_row < 0).tolist():
+        i = places.piece_train[p]
+        e = int(np.searchsorted(places.piece_first, p, side="right")) - 1
+        begin, end = max(places.depth[p] - places.length[i], 0.0), places.size[e]
+        crossed = places.cross[places.cross_first[e] : places.cross_first[e + 1]].tolist()
+        for f in (e, *crossed, *([int(places.twin[e])] if places.twin[e] >= 0 else [])):
+            there = slice(places.piece_first[f], places.piece_first[f + 1])
+            train, front = places.piece_train[there], np.minimum(places.depth[there], places.size[f])
+            rear = np.maximum(places.depth[there] - places.length[train], 0.0)
+            if f == e:
+                meets = (rear < end) & (front > begin)
+            elif f == places.twin[e]:
+                meets = (end - front < end) & (end - rear > begin)
+            else:
+                meets = np.ones(len(train), bool)
+            found[i] |= bool(np.any(meets & (train != i)))
+    return found
+
+
 @njit(cache=True)
 def _first_to_join(places: Places, i: int, own: int, guard: int) -> int:
     """A train that passes the join of the approach ``own`` of ``i`` before it, over another track; -1: none.
