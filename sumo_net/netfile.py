@@ -35,6 +35,7 @@ class NetFile(NamedTuple):
     edges: list[NetEdge]
     connections: list[dict[str, str]]
     junctions: list[NetJunction]
+    version: str  # of the format; "" if it says none
 
 
 def content(path: Path) -> bytes:
@@ -71,12 +72,12 @@ def read_net(path: Path) -> NetFile:
     LineError
         If there is no such file, it cannot be read, or it is not a net.
     """
-    net = NetFile([], [], [])
+    net = NetFile([], [], [], "")
     inside: NetEdge | NetJunction | None = None
     depth = 0
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal inside, depth
+        nonlocal net, inside, depth
         depth += 1
         if depth == 2:
             inside = None
@@ -93,8 +94,10 @@ def read_net(path: Path) -> NetFile:
                 inside.params[attributes.get("key", "")] = attributes.get("value", "")
             elif tag == "request" and isinstance(inside, NetJunction):
                 inside.requests.append(attributes)
-        elif depth == 1 and tag != "net":
-            raise LineError([f"{path}: not a SUMO net: its root element is <{tag}>, not <net>"])
+        elif depth == 1:
+            if tag != "net":
+                raise LineError([f"{path}: not a SUMO net: its root element is <{tag}>, not <net>"])
+            net = net._replace(version=attributes.get("version", ""))
 
     def end(_: str) -> None:
         nonlocal depth

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from sumo_net.layout import Floats
 from sumo_net.line import Ints, Line, line_of
-from sumo_net.netfile import RAIL, NetFile, NetJunction, read_net
+from sumo_net.netfile import RAIL, NetEdge, NetFile, NetJunction, read_net
 from sumo_net.spec import TRACK_SPACING_M, LineError
 
 Bools = NDArray[np.bool_]
@@ -247,6 +247,44 @@ def _links(connections: list[dict[str, str]], lanes: dict[str, str], inside: dic
     return list(found.values())
 
 
+def _directions(net: NetFile) -> dict[str, str]:
+    """For every edge (id) that which is the same track in the other direction, as SUMO 1.28 pairs them; "" if there is none.
+
+    Nets since version 1.0 say it. In older ones that say it nowhere it is an edge back between the same nodes whose lanes have
+    the same shapes, point by point in reverse; of several the first.
+    """
+    said = {e.attributes.get("id", ""): e.attributes.get("bidi", "") for e in net.edges}
+    if any(said.values()) or _newer(net.version):
+        return said
+    back: dict[tuple[str, str], list[NetEdge]] = {}
+    normal = [e for e in net.edges if e.attributes.get("function", "normal") == "normal"]
+    for e in normal:
+        back.setdefault((e.attributes.get("to", ""), e.attributes.get("from", "")), []).append(e)
+    for e in normal:
+        others = back.get((e.attributes.get("from", ""), e.attributes.get("to", "")), ())
+        same = (other.attributes.get("id", "") for other in others if _superposed(e, other))
+        said[e.attributes.get("id", "")] = next(same, "")
+    return said
+
+
+def _newer(version: str) -> bool:
+    """Whether a net's version is above 1.0, the last without ``bidi``."""
+    try:
+        major, minor = version.split(".")[:2]
+        return (int(major), float(minor)) > (1, 0.0)
+    except ValueError:
+        return False
+
+
+def _superposed(one: NetEdge, other: NetEdge) -> bool:
+    """Whether two edges lie on each other in opposite directions: lane by lane, the outermost on the innermost."""
+    try:
+        pairs = [(_shape(a)[::-1], _shape(b)) for a, b in zip(one.lanes, reversed(other.lanes), strict=True)]
+    except (KeyError, ValueError):  # not as many lanes; or a broken one, which is told where it matters
+        return False
+    return all(np.array_equal(a, b) for a, b in pairs)
+
+
 def _shape(lane: dict[str, str]) -> Floats:
     """Points of a lane [m], shape (P, 3) with P >= 2; heights are 0 where the net has none."""
     points = [[float(v) for v in point.split(",")] for point in lane["shape"].split()]
@@ -278,7 +316,7 @@ def _rails(net: NetFile, file: str) -> Rails:
     lanes, inside = (
         {lane.get("id", ""): name for name in part for lane in by_id[name].lanes if _for_trains(lane)} for part in (normal, within)
     )
-    bidi = {name: by_id[name].attributes.get("bidi", "") for name in lane_of}
+    bidi = _directions(net)
     links = _links(net.connections, lanes, inside, bidi)
     uses = Counter(edge for link in links for edge in {inside[lane] for lane in link.lanes})
     if shared := [name for name in within if uses[name] > 1]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trainctl.railway import along
+from trainctl.railway import bodies as in_the_way
 from trainctl.railway.ways import ways as laid
 
 HORIZONS = (40.0, 150.0, 1000.0)
@@ -53,8 +55,12 @@ def random_traffic(rng, railway, n):
     return (ways, row, s, rng.integers(2, 160, n) / 2.0, rng.random(n) < 0.9), order
 
 
-def joining(railway, traffic, order, horizon, i):
-    """All trains over other tracks that are ahead of ``i``: train, spacing, distance to the join; whether it is the next."""
+def earlier(railway, traffic, order, horizon, i):
+    """All passages of a join ahead of ``i`` that come before its own.
+
+    Row of the join and own turn; whose they are and their turn; whether over the same track; whether neither stands on the way of
+    the other before. A turn is (rank, distance, number), rank inf: undecided.
+    """
     ways, row, s, _, present = traffic
     rank = {(int(e), int(j)): int(r) for e, j, r in zip(*order, strict=True)}
 
@@ -67,24 +73,26 @@ def joining(railway, traffic, order, horizon, i):
                 seen.add(e)
 
     for k, e, turn in approaches(i):
-        found = []
         for j in set(np.flatnonzero(present).tolist()) - {i}:
             for m, f, other in approaches(j):
-                same = ways.edge[k - 1] == ways.edge[m - 1]
                 apart = ways.edge[row[j]] not in ways.edge[row[i] : k] and ways.edge[row[i]] not in ways.edge[row[j] : m]
-                if f == e and other < turn and (same or apart):
-                    found.append((other, not same, j))
-        decided = [entry for entry in found if entry[0][0] < np.inf]
-        for entry in found:
-            other, comes_over_another, j = entry
-            if comes_over_another:
-                yield j, turn[1] - other[1], turn[1], entry not in decided or entry == max(decided)
+                if f == e and other < turn:
+                    yield k, turn, j, other, ways.edge[k - 1] == ways.edge[m - 1], apart
+
+
+def joining(railway, traffic, order, horizon, i):
+    """Spacings of the trains that may be next ahead of ``i`` where they come over another track."""
+    found = [one for one in earlier(railway, traffic, order, horizon, i) if one[4] or one[5]]
+    for k, turn, _, other, same, _ in found:
+        decided = [one[3] for one in found if one[0] == k and one[3][0] < np.inf]
+        if not same and (other not in decided or other == max(decided)):
+            yield turn[1] - other[1]
 
 
 def nearest_ahead(railway, traffic, order, horizon, i):
     ways, row, s, _, present = traffic
     x = s - ways.begin[row]
-    found = [spacing for _, spacing, _, is_next in joining(railway, traffic, order, horizon, i) if is_next]
+    found = list(joining(railway, traffic, order, horizon, i))
     for k in range(row[i], ways.first[i + 1]):
         for j in np.flatnonzero(present & (ways.edge[row] == ways.edge[k])).tolist():
             spacing = ways.begin[k] + x[j] - s[i]
@@ -93,19 +101,47 @@ def nearest_ahead(railway, traffic, order, horizon, i):
     return min(found, default=np.inf)
 
 
-def bodies(traffic, j):
-    """Edges train ``j`` stands on, with how far its front is from their start."""
+def bodies(railway, traffic, j):
+    """Edges train ``j`` stands on, with how far its front is from their start, its row there (-1: behind), and whether it surely does.
+
+    Behind the beginning of its way it is laid on every edge that leads there and keeps the direction, on each the shortest way.
+    """
     ways, row, s, length, present = traffic
     k = row[j]
     while present[j]:
-        yield int(ways.edge[k]), s[j] - ways.begin[k]
-        if k == ways.first[j] or ways.begin[k] <= s[j] - length[j]:
+        yield int(ways.edge[k]), s[j] - ways.begin[k], k, True
+        if ways.begin[k] <= s[j] - length[j]:
             return
+        if k == ways.first[j]:
+            break
         k -= 1
+    if not present[j]:
+        return
+    tail, first = {}, (int(ways.edge[k]), s[j] - ways.begin[k], True)
+    for _ in railway.after:  # as often as there are edges: then every shortest way is found
+        for e, depth, sure in [first, *((e, *found) for e, found in tail.items())]:
+            into = [b for b in railway.before[e] if railway.twin[b] != e] if depth < length[j] else []
+            for b in into:
+                further = depth + railway.length_m[b]
+                if b not in tail or further < tail[b][0]:
+                    tail[b] = further, sure and len(into) == 1
+    for e, (depth, sure) in tail.items():
+        yield e, depth, -1, sure
+
+
+class Row(NamedTuple):
+    """Something in the way of a train: what is compared, then where on the way it was found."""
+
+    room: float
+    other: int
+    sense: int
+    sure: bool
+    row: int
+    kind: str
 
 
 def blocked(railway, traffic, order, horizon, virtual, i):
-    """Room, train and sense of everything in the way of ``i``."""
+    """Everything in the way of ``i``, hidden or not."""
     ways, row, s, length, present = traffic
     x = s[i] - ways.begin[row[i]]
     for k in range(row[i], ways.first[i + 1]):
@@ -114,33 +150,47 @@ def blocked(railway, traffic, order, horizon, virtual, i):
         if away > horizon:
             break
         for j in set(np.flatnonzero(present).tolist()) - {i}:
-            for f, depth in bodies(traffic, j):
+            for f, depth, _, sure in bodies(railway, traffic, j):
                 rear = depth - length[j]
                 deeper = not here or (depth, -j) > (x, -i)
                 if f == e and deeper:
                     clipped = not virtual and rear < 0.0 and k > row[i]
-                    yield away + (rear if virtual else max(rear, 0.0)), j, 0 if clipped else 1
+                    yield Row(away + (rear if virtual else max(rear, 0.0)), j, 0 if clipped else 1, sure, k, "same")
                 if railway.twin[e] == f and (not here or size - max(rear, 0.0) > x):
-                    yield away + size - min(depth, size), j, -1
+                    yield Row(away + size - min(depth, size), j, -1, sure, k, "opposing")
                 if f in railway.crossing[e] and deeper:
-                    yield away, j, 0
-    for j, spacing, distance, _ in joining(railway, traffic, order, horizon, i):
-        yield (spacing - length[j], j, 1) if virtual else (distance, j, 0)
+                    yield Row(away, j, 0, sure, k, "across")
+    for k, turn, j, other, same, apart in earlier(railway, traffic, order, horizon, i):
+        if not same and (apart or other[0] < np.inf):
+            yield Row(turn[1] - other[1] - length[j], j, 1, True, k, "join") if virtual else Row(turn[1], j, 0, True, k, "join")
 
 
-def runs_along(traffic, horizon, i, j):
-    """Whether from the front of ``j`` on both run over the same edges as far as ``i`` looks, from any of its edges."""
+def guards(railway, traffic, order, horizon, i):
+    """Trains that run all the way of ``i`` from where they stand on it as far as it looks.
+
+    How far the front of each is, and who passes a join before it, or is it: (train, row of the join in the way of ``i``).
+    """
     ways, row, s, _, _ = traffic
-    near = [int(ways.edge[k]) for k in range(row[i], ways.first[i + 1]) if ways.begin[k] - s[i] <= horizon]
-    whole = ways.edge[ways.first[j] : ways.first[j + 1]].tolist()
-    return any(whole[b : b + len(near) - a] == near[a:] for a in range(len(near)) for b in range(len(whole)))
+    near = [k for k in range(row[i], ways.first[i + 1]) if ways.begin[k] - s[i] <= horizon]
+    for j in range(len(row)):
+        passed = earlier(railway, traffic, order, horizon, j)
+        firsts = {(other, m) for m, _, other, _, _, _ in passed} | {(j, m) for m in range(row[j] + 1, ways.first[j + 1])}
+        for k in near if j != i else ():
+            for e, depth, r, _ in bodies(railway, traffic, j):
+                to_run = ways.edge[k : near[-1] + 1].tolist()
+                if r >= 0 and e == ways.edge[k] and ways.edge[r : ways.first[j + 1]].tolist()[: len(to_run)] == to_run:
+                    yield ways.begin[k] - s[i] + depth, {(other, m - r + k) for other, m in firsts}
 
 
-def standing(traffic, i):
-    """Trains of which a piece is on the way of ``i``."""
-    ways, row, _, _, _ = traffic
-    to_come = set(ways.edge[row[i] : ways.first[i + 1]].tolist())
-    return {j for j in range(len(row)) if to_come & {e for e, _ in bodies(traffic, j)}}
+def is_covered(missing, told, guarded):
+    """Whether something that is not told may be left out, by the notes of ``bodies``."""
+    if missing.kind == "same" and any(t.kind == "same" and t.other == missing.other and t.room <= missing.room for t in told):
+        return True  # a part of it is told that is nearer
+    if missing.kind != "same" and any(t.kind == missing.kind and t.row == missing.row and t.room <= missing.room for t in told):
+        return True  # of those that come the other way on one edge, lie across it, or come to one join, the nearest
+    if missing.kind == "join":
+        return any(front <= missing.room and (missing.other, missing.row) in firsts for front, firsts in guarded)
+    return any(front < missing.room for front, _ in guarded)
 
 
 @pytest.mark.parametrize("tree", [True, False])
@@ -157,24 +207,64 @@ def test_ahead_and_obstacles_are_those_of_the_slow_reference(tree, seed, n, hori
         assert found.spacing[i] == (nearest_ahead(railway, traffic, order, horizon, i) if present[i] else np.inf)
         assert (found.train[i] < 0) == np.isinf(found.spacing[i])
     for virtual in (True, False):
-        stands = along.obstacles(here, virtual)
+        stands = in_the_way.obstacles(here, virtual)
+        told = in_the_way.bodies(here, virtual)
         for i in range(n):
-            every = list(blocked(railway, traffic, order, horizon, virtual, i)) if present[i] else []
-            every = [b for b in every if b[0] <= horizon]
-            assert stands.room[i] == min((room for room, _, _ in every), default=np.inf)
-            assert not every or (stands.room[i], stands.train[i], stands.sense[i]) in every
+            every = [b for b in blocked(railway, traffic, order, horizon, virtual, i) if b.room <= horizon] if present[i] else []
+            assert stands.room[i] == min((b.room for b in every), default=np.inf)
+            assert not every or (stands.room[i], stands.train[i], stands.sense[i]) in [b[:3] for b in every]
             assert every or (stands.train[i], stands.sense[i]) == (-1, 0)
-        told = along.bodies(here, virtual)
-        rows = list(zip(told.train.tolist(), told.room.tolist(), told.other.tolist(), told.sense.tolist(), strict=True))
-        for i in range(n):
-            every = set(blocked(railway, traffic, order, horizon, virtual, i)) if present[i] else set()
-            mine = [row[1:] for row in rows if row[0] == i]
-            assert set(mine) <= every
-            on_the_way = [j for _, j, sense in mine if sense == 1 or (sense == 0 and j in standing(traffic, i))]
-            hides = [j for j in on_the_way if runs_along(traffic, horizon, i, j)]
-            if not hides:  # then every train that stands in the way is told
-                same_way = {(j, sense) for room, j, sense in every if sense == 1 and room <= horizon and j in standing(traffic, i)}
-                assert same_way <= {(j, sense) for _, j, sense in mine}
+            parts = (part[told.train == i].tolist() for part in (told.room, told.other, told.sense, told.sure))
+            mine = set(zip(*parts, strict=True))
+            assert mine <= {b[:4] for b in every}
+            shown = [b for b in every if b[:4] in mine]
+            guarded = list(guards(railway, traffic, order, horizon, i)) if present[i] else []
+            assert [b for b in every if b not in shown and not is_covered(b, shown, guarded)] == []
+
+
+def occupied(railway, traffic, j):
+    """Track that train ``j`` occupies or may occupy: edge, from, to [m], in both directions."""
+    length = traffic[3][j]
+    for e, depth, _, _ in bodies(railway, traffic, j):
+        size = railway.length_m[e]
+        begin, end = max(depth - length, 0.0), min(depth, size)
+        yield e, begin, end
+        if railway.twin[e] >= 0:
+            yield int(railway.twin[e]), size - end, size - begin
+
+
+@pytest.mark.parametrize("tree", [True, False])
+@settings(max_examples=150, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(2, 9), horizon=st.sampled_from(HORIZONS))
+def test_no_track_that_a_train_occupies_is_nearer_than_what_is_told(tree, seed, n, horizon):
+    rng = np.random.default_rng(seed)
+    railway = random_railway(rng, tree)
+    traffic, order = random_traffic(rng, railway, n)
+    ways, row, s, _, present = traffic
+    stands = in_the_way.obstacles(along.places(ways, along.net(railway), *traffic[1:], horizon, order), virtual=False)
+    for i in np.flatnonzero(present).tolist():
+        others = [piece for j in np.flatnonzero(present).tolist() if j != i for piece in occupied(railway, traffic, j)]
+        for k in range(row[i], ways.first[i + 1]):
+            start = max(s[i] - ways.begin[k], 0.0)  # only what lies before the front
+            ends = [max(a, start) for e, a, b in others if e == ways.edge[k] and b > start + 1e-6]
+            if ends and (nearest := ways.begin[k] + min(ends) - s[i]) <= horizon:
+                assert stands.room[i] <= nearest + 1e-6
+                break
+
+
+@settings(max_examples=150, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(2, 9))
+def test_tails_behind_the_beginning_foul_what_they_would_lie_on_and_across(seed, n):
+    rng = np.random.default_rng(seed)
+    railway = random_railway(rng, False)
+    traffic, _ = random_traffic(rng, railway, n)
+    found = in_the_way.fouling(along.places(traffic[0], along.net(railway), *traffic[1:], 100.0))
+    for i in range(n):
+        tail = [(e, max(depth - traffic[3][i], 0.0)) for e, depth, k, _ in bodies(railway, traffic, i) if k < 0]
+        others = [piece for j in set(range(n)) - {i} for piece in occupied(railway, traffic, j)]
+        across = {e for j in set(range(n)) - {i} for f, *_ in bodies(railway, traffic, j) for e in railway.crossing[f]}
+        lies_on = any(e == f and b > rear and a < railway.length_m[e] for e, rear in tail for f, a, b in others)
+        assert found[i] == (lies_on or any(e in across for e, _ in tail))
 
 
 @settings(max_examples=60, deadline=None)

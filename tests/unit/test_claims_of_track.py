@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from trainctl.railway import along, interlocking
+from trainctl.railway import bodies as in_the_way
 from trainctl.railway.ways import ways as laid
 
 BRAKING = 0.8  # m/s2
@@ -226,6 +227,9 @@ def drive(net_of, routes, seed, n, limit=9000):
         state, held, _ = interlocking.claim(zones, state, row, s, length, present, reach, 2 * MARGIN)
         here = along.places(ways, net, row, s, length, present, 3000.0, interlocking.order(state))
         room = np.minimum(along.obstacles(here, virtual=False).room, held.room) - MARGIN
+        state, held, _ = interlocking.claim(zones, state, row, s, length, present, reach, 2 * MARGIN)
+        here = along.places(ways, net, row, s, length, present, 3000.0, interlocking.order(state))
+        room = np.minimum(in_the_way.obstacles(here, virtual=False).room, held.room) - MARGIN
         wanted = np.minimum(v + acceleration, top)
         stops = -BRAKING + np.sqrt(BRAKING**2 + 2 * BRAKING * np.maximum(room, 0.0))  # v^2 / 2b + v <= room
         v = np.where(present, np.minimum(wanted, stops), 0.0)

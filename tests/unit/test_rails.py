@@ -270,6 +270,49 @@ def test_twins_of_internal_edges_are_found_where_an_old_net_does_not_name_them(c
     assert (named.twin >= 0).all()
 
 
+#: How a net of an old version may look -> its version, and what is written otherwise: pattern, replacement, how often.
+OLD_NETS: dict[str, tuple[str, list[tuple[str, str, int]]]] = {
+    "old": ("0.27", [(' bidi="[^"]*"', "", 0)]),
+    "none": ("1.0", [(' bidi="[^"]*"', "", 0)]),
+    "new": ("1.1", [(' bidi="[^"]*"', "", 0)]),
+    "newest": ("1.20", [(' bidi="[^"]*"', "", 0)]),
+    "some named": ("0.27", [(' bidi="[^"]*"', "", 11)]),
+    "a hair beside": ("0.27", [(' bidi="[^"]*"', "", 0), (r'(<lane id="main\+_0"[^>]*shape="[^, "]*,[^, "]*)', r"\g<1>0001", 0)]),
+    "another height": ("0.27", [(' bidi="[^"]*"', "", 0), (r'(<lane id="main\+_0"[^>]*shape="[^ "]*)', r"\1,1.00", 0)]),
+    "height zero": ("0.27", [(' bidi="[^"]*"', "", 0), (r'(<lane id="main\+_0"[^>]*shape="[^ "]*)', r"\1,0.00", 0)]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", OLD_NETS)
+def test_the_two_directions_of_a_track_are_paired_as_sumo_pairs_them(convert, kind):
+    # A second main track on the very same place, a road of two lanes both ways, and one with fewer lanes back.
+    edges = {
+        **LOOP_EDGES, "again+": LOOP_EDGES["main+"], "again-": LOOP_EDGES["main-"],
+        "road+": 'w k numLanes="2" spreadType="center"', "road-": 'k w numLanes="2" spreadType="center"',
+        "wide+": 'k e numLanes="2" spreadType="center"', "wide-": 'e k spreadType="center"',
+    }  # fmt: skip
+    net = convert(LOOP, edges, "", "--no-turnarounds", lane='allow="rail" speed="30"')
+    version, changes = OLD_NETS[kind]
+    words = re.sub(r'<net version="[^"]*"', f'<net version="{version}"', net.read_text())
+    for pattern, replacement, count in changes:
+        words, changed = re.subn(pattern, replacement, words, count=count)
+        assert changed
+    net.write_text(words)
+    rails = Rails.read(net)
+    libsumo.start(["sumo", "-n", str(net), "--no-step-log", "--no-warnings"])
+    try:
+        theirs = {e: libsumo.edge.getBidiEdge(e) for e in rails.edges if not rails.internal[rails.index[e]]}
+    finally:
+        libsumo.close()
+    ours = {e: rails.edges[t] if (t := rails.twin[rails.index[e]]) >= 0 else "" for e in theirs}
+    assert ours == theirs
+    paired = {e for e, twin in theirs.items() if twin}
+    apart = {"main+"} if kind in ("a hair beside", "another height") else set()
+    if kind != "some named":  # where netconvert names them lane by lane
+        everyone = {f"{e}{way}" for e in ("west", "main", "again", "side", "edis", "east", "road") for way in "+-"}
+        assert paired == (set() if kind.startswith("new") else everyone - apart)
+
+
 def test_a_reversal_is_a_connection_to_the_twin_and_no_part_of_the_kilometrage(convert):
     nodes, edges = {"a": (0, 0), "b": (500, 0), "c": (900, 0)}, {"ab": "a b", "bc": "b c", "cb": "c b", "ba": "b a"}
     edges = {e: words + ' spreadType="center"' for e, words in edges.items()}

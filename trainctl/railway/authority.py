@@ -10,6 +10,7 @@ from numba import njit
 from trainctl.kernels import keep_by_sources
 from trainctl.railway import along
 from trainctl.railway.along import Ahead
+from trainctl.railway.bodies import Bodies, bodies, fouling
 from trainctl.railway.supervisor import LIMIT, OPPOSING, SWITCH, TRAIN, Assumed, Limits, Params, Targets, Verdict, verdict
 from trainctl.railway.ways import Ways
 from trainctl.signals import Bools, Floats, Ints
@@ -28,8 +29,9 @@ class View(NamedTuple):
     targets: Targets  # a train that joins ahead counts as if it were on the own track already
     clear: Targets  # before a train that joins ahead the join itself is kept clear; a train needs to heed one of the two only
     limits: Limits
-    room: Floats  # (n,) m, to the body on the own way; inf: none
+    room: Floats  # (n,) m, to the body on the own way that surely is there; inf: none
     body: Ints  # (n,) whose it is, -1: none
+    fouling: Bools  # (n,) its tail lies on another train behind the beginning of its way, see ``topology.bodies``
 
 
 def look(
@@ -63,18 +65,18 @@ def look(
         Targets are the bodies ahead and the places where trains are held, limits those of the edges under every train and ahead.
     """
     placed = along.places(ways, net, row, s, length, present, horizon, order)
-    bodies = along.bodies(placed, virtual=False)
-    clear = _targets(bodies, held, speed, present)
-    targets = _targets(along.bodies(placed), held, speed, present) if len(placed.join_train) else clear
+    there = bodies(placed, virtual=False)
+    clear = _targets(there, held, speed, present)
+    targets = _targets(bodies(placed), held, speed, present) if len(placed.join_train) else clear
     room, body = np.full(len(row), np.inf), np.full(len(row), -1, np.int64)
-    far_first = np.argsort(-bodies.room)
-    there = far_first[bodies.sense[far_first] != 0]
-    room[bodies.train[there]], body[bodies.train[there]] = bodies.room[there], bodies.other[there]  # the nearest is written last
+    far_first = np.argsort(-there.room)
+    real = far_first[(there.sense[far_first] != 0) & there.sure[far_first]]
+    room[there.train[real]], body[there.train[real]] = there.room[real], there.other[real]  # the nearest is written last
     limits = Limits(*_limits(ways, limit, factor, row, s, length, present, horizon))
-    return View(along.ahead(placed), targets, clear, limits, room, body)
+    return View(along.ahead(placed), targets, clear, limits, room, body, fouling(placed))
 
 
-def _targets(body: along.Bodies, held: Floats, speed: Floats, present: Bools) -> Targets:
+def _targets(body: Bodies, held: Floats, speed: Floats, present: Bools) -> Targets:
     """Bodies in the way, and the places where trains are held.
 
     Who comes the other way beyond the place where a train is held turns off before, or is held itself.

@@ -167,6 +167,8 @@ class Traffic:
         other = int(view.ahead.train[i])
         if other >= 0 and roster.cooperates[[i, other]].all() and view.ahead.spacing[i] < self.p.spacing.desired - 1.0:
             return None
+        if view.fouling[i] or np.any(view.clear.room[view.clear.other == i] < 0.0):  # another would be under it, or its tail
+            return None
         trial = speed.copy()
         trial[i] = entry
         behind = view.targets.other == i
