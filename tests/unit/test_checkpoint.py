@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections import deque
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +13,10 @@ import pytest
 from trainctl import checkpoint
 from trainctl.checkpoint import Saved, Tape, leaves, refill
 from trainctl.errors import InputError
+from trainctl.loop import Simulation
 from trainctl.prepare import open_scenario
 from trainctl.record.folder import claim, free, held, ours, remove, write_info
+from trainctl.record.journal import Journal
 from trainctl.runner import again, begin, opened
 from trainctl.signals import Demand
 from trainctl.world import Numeric, Start
@@ -149,6 +153,64 @@ def test_every_array_of_trains_that_come_and_go_is_in_a_checkpoint(tmp_path):
         assert lost == {"roster", "cruise"}  # as they were read
         lookout = {name for name, value in vars(simulation.lookout).items() if list(leaves("x", value))}
         assert lookout == {"net", "length", "factor", "ways", "zones", "waits_for"}
+
+
+#: Data that does not change; what is outside; functions; written anew in every step before it is read; made of the world's ways.
+NOT_STATE = {"p", "world", "journal", "between", "parts", "stops", "ways", "zones"}
+
+
+def remembered(name, thing):
+    """All numbers, words and arrays an object of ours holds, and those of all objects in it, with their places."""
+    if thing is None or isinstance(thing, bool | int | float | str | np.ndarray | np.generic):
+        yield name, thing
+    elif isinstance(thing, dict):
+        yield f"{name}, keys", str(sorted(thing, key=str))
+        for key, value in thing.items():
+            yield from remembered(f"{name}[{key}]", value)
+    elif isinstance(thing, tuple | list | deque):
+        yield f"{name}, length", len(thing)
+        for k, value in enumerate(thing):
+            yield from remembered(f"{name}[{k}]", value)
+    elif type(thing).__module__.startswith("trainctl.") and hasattr(thing, "__dict__"):
+        for key, value in vars(thing).items():
+            if key not in NOT_STATE:
+                yield from remembered(f"{name}.{key}", value)
+
+
+def same(one, two):
+    if isinstance(one, np.ndarray) and isinstance(two, np.ndarray):
+        return one.dtype == two.dtype and one.shape == two.shape and one.tobytes() == two.tobytes()
+    return type(one) is type(two) and (one == two or one != one)
+
+
+BUSY = {
+    "three_tracks": {"supervisor.mode": "on", "topology.loss": 0.3, "run.seed": 1},
+    "fault_tolerant_noise": {"topology.communication_period_s": 0.5, "topology.loss": 0.2, "topology.delay_s": 1.0},
+    "fully_distributed_loss": {"topology.delay_s": 2.0},
+    "merging": {"run.duration_s": 400},
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "steps"), [("three_tracks", 150), ("fault_tolerant_noise", 5), ("fully_distributed_loss", 1010), ("merging", 300)]
+)
+def test_a_simulation_that_goes_on_from_a_checkpoint_remembers_all_that_one_does_which_went_on(name, steps, tmp_path):
+    p = open_scenario(name, BUSY[name])
+    with closing(Journal(tmp_path, p)) as journal, closing(Tape(Numeric(p.line), tmp_path)) as tape:
+        went_on = Simulation(p, tape, journal)
+        for k in range(steps):
+            if name == "three_tracks" and k == 20:
+                went_on.outside[:] = -5.0, *[5.0] * 5  # so that the supervisor has to act
+            went_on.step()
+        assert name != "three_tracks" or went_on.supervision.acting.any()
+        checkpoint.write(tmp_path, went_on, {**checkpoint.identity(p), "tape": tape.save()})
+    saved = checkpoint.read(tmp_path, p)
+    with closing(Tape(Numeric(p.line), tmp_path, saved)) as tape:
+        restored = Simulation(p, tape, checkpoint.Unheard())
+        checkpoint.restore(restored, tape, saved)
+    expected, found = (dict(remembered("simulation", s)) for s in (went_on, restored))
+    assert len(expected) > 60
+    assert [place for place in expected | found if not same(expected.get(place), found.get(place))] == []
 
 
 @pytest.mark.parametrize("own_line", [False, True])
