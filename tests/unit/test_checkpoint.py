@@ -7,8 +7,10 @@ from collections import deque
 from contextlib import closing
 from pathlib import Path
 
+import nets
 import numpy as np
 import pytest
+import tomli_w
 
 from trainctl import checkpoint
 from trainctl.checkpoint import Saved, Tape, leaves, refill
@@ -156,7 +158,7 @@ def test_every_array_of_trains_that_come_and_go_is_in_a_checkpoint(tmp_path):
 
 
 #: Data that does not change; what is outside; functions; written anew in every step before it is read; made of the world's ways.
-NOT_STATE = {"p", "world", "journal", "between", "parts", "stops", "ways", "zones"}
+NOT_STATE = {"p", "world", "journal", "between", "parts", "stops", "held", "ways", "zones"}
 
 
 def remembered(name, thing):
@@ -183,26 +185,35 @@ def same(one, two):
     return type(one) is type(two) and (one == two or one != one)
 
 
+#: Scenario, changes, and how many steps later it is busy: much is under way, or has come to be otherwise than at the start.
 BUSY = {
-    "three_tracks": {"supervisor.mode": "on", "topology.loss": 0.3, "run.seed": 1},
-    "fault_tolerant_noise": {"topology.communication_period_s": 0.5, "topology.loss": 0.2, "topology.delay_s": 1.0},
-    "fully_distributed_loss": {"topology.delay_s": 2.0},
-    "merging": {"run.duration_s": 400},
-}
+    "units": ("three_tracks", {"supervisor.mode": "on", "topology.loss": 0.3, "run.seed": 1}, 150),
+    "actuators": (
+        "fault_tolerant_noise", {"topology.communication_period_s": 0.5, "topology.loss": 0.2, "topology.delay_s": 1.0}, 5
+    ),
+    "points": ("fully_distributed_loss", {"topology.delay_s": 2.0}, 1010),
+    "formations": ("merging", {}, 300),
+    "single track": ("", {}, 300),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("name", "steps"), [("three_tracks", 150), ("fault_tolerant_noise", 5), ("fully_distributed_loss", 1010), ("merging", 300)]
-)
-def test_a_simulation_that_goes_on_from_a_checkpoint_remembers_all_that_one_does_which_went_on(name, steps, tmp_path):
-    p = open_scenario(name, BUSY[name])
+@pytest.mark.parametrize("case", BUSY)
+def test_a_simulation_that_goes_on_from_a_checkpoint_remembers_all_that_one_does_which_went_on(case, tmp_path):
+    name, changes, steps = BUSY[case]
+    if case == "single track":
+        name = str(tmp_path / "s.toml")
+        up = nets.flow("up", nets.UP, 2, 60, departSpeed="0")
+        nets.single_track(tmp_path, up + nets.flow("down", nets.DOWN, 2, 60, 20, departSpeed="0"))
+        (tmp_path / "s.toml").write_text(tomli_w.dumps(nets.scenario("robust_constrained", 900)))
+    p = open_scenario(name, changes)
     with closing(Journal(tmp_path, p)) as journal, closing(Tape(Numeric(p.line), tmp_path)) as tape:
         went_on = Simulation(p, tape, journal)
         for k in range(steps):
-            if name == "three_tracks" and k == 20:
+            if case == "units" and k == 20:
                 went_on.outside[:] = -5.0, *[5.0] * 5  # so that the supervisor has to act
             went_on.step()
-        assert name != "three_tracks" or went_on.supervision.acting.any()
+        assert case != "units" or went_on.supervision.acting.any()
+        assert case != "single track" or (went_on.lookout.waits_for >= 0).any()
         checkpoint.write(tmp_path, went_on, {**checkpoint.identity(p), "tape": tape.save()})
     saved = checkpoint.read(tmp_path, p)
     with closing(Tape(Numeric(p.line), tmp_path, saved)) as tape:
