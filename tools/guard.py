@@ -45,7 +45,10 @@ OF_UNITS = ("emu_", "fault_tolerant")
 BASELINE_AT_MOST_S = 400.0
 
 #: What tells headers, clocks and durations of the computer in SUMO's logs.
-CLOCKS = re.compile(r'<\?xml.*?\?>|<!--.*?-->|<performance [^>]*/>|\bduration="\d+"(?=\s*/>)|\b[\d.]+ ?ms\b', re.DOTALL)
+CLOCKS = re.compile(
+    r'<\?xml.*?\?>|<!--.*?-->|<performance [^>]*/>|\bduration="\d+"(?=\s*/>)|\b[\d.]+ms\b|(Duration|Real time factor|UPS): \S+',
+    re.DOTALL,
+)
 
 #: What run.json says beside the run.
 OF_THE_COMPUTER = ("wall_time_s", "command_line", "versions")
