@@ -23,7 +23,7 @@ import tempfile
 import time
 import tomllib
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,6 +33,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 HERE = Path(__file__).resolve().parent.parent
+
+BACKENDS = ("sumo", "numeric")
 
 #: Runs end here at the latest [s]: behind the switches at 1000 s of the shipped scenarios.
 AT_MOST_S = 1060.0
@@ -75,10 +77,10 @@ def shipped(checkout: Path, at_most_s: float) -> Iterator[Job]:
         name = path.stem
         units = name.startswith(OF_UNITS) and not name.endswith("_reroute")
         end = min(own_duration_s(path), at_most_s, UNITS_AT_MOST_S if units else at_most_s)
-        for backend in ("sumo", "numeric"):
+        for backend in BACKENDS:
             yield Job(f"{name}/{backend}", name, backend, (f"run.duration_s={end:g}",))
     end = min(at_most_s, BASELINE_AT_MOST_S)
-    for backend in ("sumo", "numeric"):
+    for backend in BACKENDS:
         settings = (f"run.duration_s={at_most_s:g}", "supervisor.mode=on")
         yield Job(f"three_tracks, supervised/{backend}", "three_tracks", backend, settings)
     for name in ("three_tracks", "merging"):
@@ -93,16 +95,21 @@ def own_duration_s(path: Path) -> float:
     return own_duration_s((path.parent / tables["extends"]).with_suffix(".toml"))
 
 
+def asked(name: str, only: list[str]) -> bool:
+    """Whether a run is asked for: its name contains one of these, or there are none."""
+    return not only or any(word in name for word in only)
+
+
 def of_nets(folder: Path) -> Iterator[Job]:
     """Every kind of net of tests/nets.py, under its law and the supervisor; needs the folder ``nets`` has written."""
     for path in sorted(folder.glob("*/s.toml")):
         case = path.parent.name
-        for backend in ("sumo",) if case.endswith("baseline") else ("sumo", "numeric"):
+        for backend in BACKENDS[:1] if case.endswith("baseline") else BACKENDS:
             yield Job(f"net {case}/{backend}", str(path), backend, ())
 
 
-def write_nets(folder: Path, at_most_s: float) -> None:
-    """Write nets, traffic and scenarios: in a process that has the code and the tests of this checkout on its path."""
+def write_nets(folder: Path, at_most_s: float, only: list[str]) -> None:
+    """Write the nets asked for, their traffic and scenarios; the code and the tests of this checkout must be on Python's path."""
     import nets
     import tomli_w
 
@@ -128,6 +135,8 @@ def write_nets(folder: Path, at_most_s: float) -> None:
     ]
     for case, make, law, duration, changes in cases:
         place = folder / case.replace(", ", "_").replace(" ", "_")
+        if not any(asked(f"net {place.name}/{backend}", only) for backend in BACKENDS):
+            continue
         make(place)
         tables = nets.scenario(law, min(duration, at_most_s), **changes)
         if case.endswith("baseline"):
@@ -135,7 +144,8 @@ def write_nets(folder: Path, at_most_s: float) -> None:
         if "long" in tables["train_type"]:
             tables["train_type"]["long"] |= {"unit_length_m": 250.0}
         (place / "s.toml").write_text(tomli_w.dumps(tables), encoding="utf-8")
-    hilly(folder / "hilly", at_most_s)
+    if any(asked(f"net hilly/{backend}", only) for backend in BACKENDS):
+        hilly(folder / "hilly", at_most_s)
 
 
 def hilly(place: Path, at_most_s: float) -> None:
@@ -265,15 +275,14 @@ def done(job: Job, checkout: Path, folder: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def run_all(checkout: Path, at_most_s: float, only: Iterable[str], at_a_time: int, folder: Path) -> dict[str, Any]:
-    """Run everything whose name contains one of ``only`` (all if none) in ``folder``."""
+def run_all(checkout: Path, at_most_s: float, only: list[str], at_a_time: int, folder: Path) -> dict[str, Any]:
+    """Run what is asked for in ``folder``."""
     nets = folder / "nets"
-    command = [sys.executable, __file__, "nets", str(nets), str(at_most_s)]
+    command = [sys.executable, __file__, "nets", str(nets), str(at_most_s), *only]
     subprocess.run(command, env=environment(HERE, HERE / "tests"), check=True)
-    words = list(only)
-    jobs = [j for j in (*shipped(checkout, at_most_s), *of_nets(nets)) if not words or any(word in j.name for word in words)]
+    jobs = [job for job in (*shipped(checkout, at_most_s), *of_nets(nets)) if asked(job.name, only)]
     if not jobs:
-        raise SystemExit(f"guard: nothing is called {' or '.join(words)}")
+        raise SystemExit(wrong(f"--only {' '.join(only)}: no run has such a name"))
     runs: dict[str, Any] = {}
     with ThreadPoolExecutor(at_a_time) as pool:
         waiting = {pool.submit(done, job, checkout, folder / "runs"): job.name for job in jobs}
@@ -354,21 +363,24 @@ def main() -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
-    asked = commands.add_parser("run", help="run everything and write hashes")
-    asked.add_argument("--checkout", type=Path, default=HERE, help="whose code runs; default this one")
-    asked.add_argument("--out", type=Path, required=True, help="JSON file, outside of any checkout")
-    asked.add_argument("--at-most", type=float, default=AT_MOST_S, metavar="S", help=f"end of the runs [s]; default {AT_MOST_S:g}")
-    asked.add_argument("--only", action="append", default=[], help="runs whose name contains this; repeatable; default all")
-    asked.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs at a time; default one per processor")
-    asked.add_argument("--keep", type=Path, help="an empty folder for the runs; default they are thrown away")
-    asked = commands.add_parser("compare", help="tell what differs; exit code 1 if anything does")
-    asked.add_argument("files", type=Path, nargs=2, metavar="FILE")
-    asked = commands.add_parser("nets")  # of a process of its own
-    asked.add_argument("folder", type=Path)
-    asked.add_argument("at_most", type=float)
+    options = commands.add_parser("run", help="run everything and write hashes")
+    options.add_argument("--checkout", type=Path, default=HERE, help="whose code runs; default this one")
+    options.add_argument("--out", type=Path, required=True, help="JSON file, outside of any checkout")
+    options.add_argument(
+        "--at-most", type=float, default=AT_MOST_S, metavar="S", help=f"end of the runs [s]; default {AT_MOST_S:g}"
+    )
+    options.add_argument("--only", action="append", default=[], help="runs whose name contains this; repeatable; default all")
+    options.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs at a time; default one per processor")
+    options.add_argument("--keep", type=Path, help="an empty folder for the runs; default they are thrown away")
+    options = commands.add_parser("compare", help="tell what differs; exit code 1 if anything does")
+    options.add_argument("files", type=Path, nargs=2, metavar="FILE")
+    options = commands.add_parser("nets")  # of a process of its own
+    options.add_argument("folder", type=Path)
+    options.add_argument("at_most", type=float)
+    options.add_argument("only", nargs="*")
     arguments = parser.parse_args()
     if arguments.command == "nets":
-        write_nets(arguments.folder, arguments.at_most)
+        write_nets(arguments.folder, arguments.at_most, arguments.only)
         return 0
     if arguments.command == "compare":
         one, two = map(read, arguments.files)
