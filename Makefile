@@ -7,7 +7,7 @@ READY := .venv/.ready
 
 help:
 	@echo "make run    the default scenario, headless, into runs/three_tracks"
-	@echo "make test   the test suite"
+	@echo "make test   the test suite, on two processors"
 	@echo "make lint   ruff, mypy and the import rules"
 	@echo "make clean  remove .venv and runs"
 
@@ -15,7 +15,7 @@ run: $(READY)
 	$(BIN)/trainctl run
 
 test: $(READY)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist worksteal --durations=25
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import fcntl
+import hashlib
 import signal
 import sys
 from collections.abc import Callable
@@ -17,19 +19,30 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
-    """Run a scenario once per session: finished("three_tracks", "numeric", **{"run.duration_s": 60}) is its run folder."""
+def finished(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Callable[..., Any]:
+    """Run a scenario once per session: finished("three_tracks", "numeric", **{"run.duration_s": 60}) is its run folder.
+
+    Processes that share the suite (pytest -n) share the folders too: whoever comes first runs, the others wait for it.
+    """
     from trainctl.runner import run
     from trainctl.runs.run import Run
     from trainctl.scenario.build import open_scenario
 
-    done: dict[Any, Run] = {}
+    base = tmp_path_factory.getbasetemp()
+    place = (base if worker_id == "master" else base.parent) / "finished"
+    place.mkdir(exist_ok=True)
+    done: dict[str, Run] = {}
 
     def finish(name: str, backend: str = "sumo", **overrides: Any) -> Run:
-        key = (name, backend, repr(sorted(overrides.items())))
+        key = repr((name, backend, sorted(overrides.items())))
         if key not in done:
-            folder: Path = tmp_path_factory.mktemp("runs") / Path(name).stem
-            done[key] = run(open_scenario(name, overrides), folder, backend)  # type: ignore[arg-type]
+            folder = place / hashlib.sha256(key.encode()).hexdigest()[:16] / Path(name).stem
+            folder.parent.mkdir(exist_ok=True)
+            with (folder.parent / "lock").open("w") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                if not folder.exists():
+                    run(open_scenario(name, overrides), folder, backend)  # type: ignore[arg-type]
+            done[key] = Run(folder)
         return done[key]
 
     return finish

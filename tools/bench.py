@@ -16,6 +16,8 @@ client             TraCI as people write it: three reads and one command per tra
 coupled_units      numeric: ``fully_distributed`` on trains of four units, sub-steps of 10 ms
 finite_time        numeric: ``emu_finite_time`` on the same trains
 actuated_units     numeric: ``fault_tolerant`` with its observer on trains of four units with actuators
+supervised         numeric: the loop under the supervisor
+traffic            numeric: trains that come from two lines each, form up where these merge, and are supervised
 =================  ===============================================================================================================
 
 The net is fixed: three parallel tracks cut into edges of 5 km, ``bench_three_tracks``, as long as the trains need. The outputs of
@@ -24,6 +26,10 @@ until the logs are closed, per train and step [us]; ``peak_mb`` is the peak resi
 processor is told too (``cpu_``, all threads): where others use the machine it is the truer figure.
 
 ``sparse`` is compared with the bare step that writes FCD in every step. CPU times of ``traci`` and ``client`` hold SUMO's start.
+
+``--against CHECKOUT`` compares this checkout with another one: the same cases, those with our loop, driven through
+``trainctl.Simulation`` from either. Both take turns every few steps as the cases do; told are medians of the ratios within a pair,
+this checkout over the other, with the least and the greatest. Closing the logs is left out.
 
 ``--instructions`` counts instead of measuring: instructions per train and step, by valgrind, which must be installed. They are no
 times (a cache miss is not seen), but the same whatever else the machine does: they tell whether a change made anything cheaper.
@@ -47,10 +53,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+HERE = Path(__file__).resolve().parent.parent
 SIZES = (10, 100, 1000, 10_000)
 IN_SUMO = ("bare", "idle", "rail", "loop", "sparse", "traci", "client")
 ALONE = ("bare", "idle", "rail", "client")  # without our loop
-NUMERIC = ("coupled_units", "finite_time", "actuated_units")
+NUMERIC = ("coupled_units", "finite_time", "actuated_units", "supervised", "traffic")
+OURS = ("loop", "sparse", *NUMERIC)  # compared between checkouts
 #: Compared to a few per cent; through TraCI everything is many times slower, which one repeat tells.
 REPEATED = ("bare", "idle", "rail", "loop", "sparse")
 PARTS = ("read", "topology", "control", "plant", "write", "step", "record")
@@ -59,8 +67,14 @@ SPEED_MPS = 80.0
 SPACING_M = dict.fromkeys((*IN_SUMO, *NUMERIC), 500.0) | {"finite_time": 900.0, "actuated_units": 900.0}
 
 #: Train-steps of one repeat, about; the slower a case, the fewer.
-WORK = {"traci": 15_000, "client": 10_000, "coupled_units": 30_000, "finite_time": 20_000, "actuated_units": 9_000}
+WORK = {
+    "traci": 15_000, "client": 10_000, "coupled_units": 30_000, "finite_time": 20_000, "actuated_units": 9_000,
+    "supervised": 60_000, "traffic": 60_000,
+}  # fmt: skip
 IN_SUMO_WORK = 120_000
+
+#: Steps before those that are measured: until then all trains have come.
+BEFORE = {"traffic": 120}
 
 #: Steps of the two runs whose instructions are compared; in between, the recorder writes at 1000 trains what 66 steps hold.
 COUNTED = (10, 76)
@@ -81,6 +95,8 @@ def steps_of(case: str, trains: int) -> int:
 
 def scenario(case: str, trains: int, steps: int) -> tuple[str, str]:
     """TOML of the scenario and of its line: trains take turns on the tracks, a little off their slots."""
+    if case == "traffic":
+        return f"{_TRAFFIC}[run]\nduration_s = {steps}\nstep_s = 1.0\ncontrol_period_s = 8.0\n", ""
     spacing, rows = SPACING_M[case], -(-trains // 3)
     slots = case in ("finite_time", "actuated_units")  # these laws want one slot per train, whatever its track
     front = 1000.0 + (trains if slots else rows) * spacing
@@ -101,6 +117,39 @@ def scenario(case: str, trains: int, steps: int) -> tuple[str, str]:
         track = (1, 2, 3)[i // rows if slots else i % 3]
         body.append(f'[[train]]\nid = {i + 1}\ntype = "train"\ntrack = {track}\nposition_m = {position}\nspeed_mps = {speed}')
     return "\n".join(body) + "\n", line
+
+
+#: Of the railway of ``traffic``: trains per piece, length of the branches and of the line they merge into.
+PER_PIECE, BRANCH_M, TRUNK_M = 8, 6000.0, 40_000.0
+
+
+def railway(folder: Path, trains: int) -> None:
+    """Pieces of railway beside each other: in each, two branches merge, and trains come on both every 20 s."""
+    from sumo_net.build import program
+
+    nodes, edges, came = [], [], []
+    for k in range(-(-trains // PER_PIECE)):
+        y = 4000.0 * k
+        places = {"w": (0.0, y), "s": (0.0, y - 1500.0), "m": (BRANCH_M, y), "e": (BRANCH_M + TRUNK_M, y)}
+        nodes += [f'<node id="{name}{k}" x="{x}" y="{at}"/>' for name, (x, at) in places.items()]
+        for name, begin, end in (("west", "w", "m"), ("south", "s", "m"), ("trunk", "m", "e")):
+            edges.append(f'<edge id="{name}{k}" from="{begin}{k}" to="{end}{k}" numLanes="1" speed="40" allow="rail"/>')
+    for i in range(trains):
+        k, turn = divmod(i, PER_PIECE)
+        branch, depart = ("west", "south")[turn % 2], 20.0 * (turn // 2) + 7.0 * (turn % 2)
+        came.append((depart, i, f'<route edges="{branch}{k} trunk{k}"/>'))
+    body = "".join(f'<vehicle id="{i}" type="emu" depart="{t}" departSpeed="max">{way}</vehicle>' for t, i, way in sorted(came))
+    kind = '<vType id="emu" vClass="rail" length="100" maxSpeed="45"/>'
+    (folder / "a.nod.xml").write_text(f"<nodes>{''.join(nodes)}</nodes>", encoding="utf-8")
+    (folder / "a.edg.xml").write_text(f"<edges>{''.join(edges)}</edges>", encoding="utf-8")
+    (folder / "a.rou.xml").write_text(f"<routes>{kind}{body}</routes>", encoding="utf-8")
+    (folder / "a.sumocfg").write_text(
+        '<configuration><input><net-file value="a.net.xml"/><route-files value="a.rou.xml"/></input></configuration>',
+        encoding="utf-8",
+    )
+    netconvert, environment = program("netconvert")
+    files = ["-n", "a.nod.xml", "-e", "a.edg.xml", "-o", "a.net.xml", "--no-turnarounds"]
+    subprocess.run([netconvert, *files], cwd=folder, env=environment, check=True, capture_output=True)
 
 
 _DAVIS = "c0_n_per_kg = 1.176e-2\nc1_ns_per_m_kg = 7.7616e-4\nc2_ns2_per_m2_kg = 1.6e-5\n"
@@ -185,6 +234,33 @@ actuator_rate_per_s = 50.0
 }
 
 
+_LAWS["supervised"] = _LAWS["loop"] + '[supervisor]\nmode = "on"\n'
+_TRAFFIC = f"""schema_version = 1
+title = "Bench"
+[network]
+sumocfg = "a.sumocfg"
+[controller]
+law = "fully_distributed"
+join = "ratchet"
+[plant]
+kind = "point"
+[reference]
+speed_mps = 36.0
+[bounds]
+speed_lower_mps = 30.0
+speed_upper_mps = 42.0
+input_lower_mps2 = -1.0
+input_upper_mps2 = 1.0
+[topology]
+spacing_m = 500.0
+lower_m = 250.0
+upper_m = 1600.0
+[train_type.emu]
+unit_length_m = 100.0
+unit_mass_kg = 200000.0
+{_DAVIS}"""
+
+
 # One case, in a process of its own
 
 
@@ -222,6 +298,15 @@ class Clock:
                 return function(*arguments, **more)
 
         setattr(owner, name, timed)
+
+
+def of_this(checkout: Path) -> None:
+    """Stop if the code is not that of the checkout."""
+    import trainctl
+
+    found = Path(trainctl.__file__).resolve().parent.parent
+    if found != checkout:
+        raise SystemExit(f"trainctl comes from {found}, not from {checkout}")
 
 
 def peak_mb() -> float:
@@ -303,7 +388,7 @@ def alone(folder: Path, case: str) -> Case:
     return Case(len(names), idle if case == "idle" else timed, libsumo.close, clock)
 
 
-def client(folder: Path) -> Case:
+def client(folder: Path, case: str) -> Case:
     """A loop around SUMO through TraCI that asks for and commands one train after the other."""
     api = through_traci()
     api.start(json.loads((folder / "command.json").read_text(encoding="utf-8")))
@@ -366,6 +451,17 @@ def closed(folder: Path, case: str) -> Case:
     return Case(len(prepared.scenario.ids), simulation.step, close, clock)
 
 
+def public(folder: Path, case: str) -> Case:
+    """Our loop through what every checkout has: ``trainctl.Simulation``."""
+    import trainctl
+
+    simulation = trainctl.Simulation.open(
+        folder / "scenario.toml", backend="sumo" if case in IN_SUMO else "numeric", out=folder / "run", force=True
+    )
+    simulation.step()  # compiles or loads what the kernels need
+    return Case(len(simulation.trains), simulation.step, lambda: None, Clock())
+
+
 def through_traci() -> Any:
     """A stand-in for the module libsumo that goes through TraCI."""
     import types
@@ -392,9 +488,11 @@ def through_traci() -> Any:
     return shim
 
 
-def child(case: str, folder: Path) -> None:
+def child(case: str, folder: Path, kind: Callable[[Path, str], Case]) -> None:
     """What runs in a process of its own: as many steps as each line of its input says; at the end, one JSON object."""
-    running = client(folder) if case == "client" else (alone if case in ALONE else closed)(folder, case)
+    running = kind(folder, case)
+    for _ in range(BEFORE.get(case, 0)):
+        running.step()
     seconds, cpu = 0.0, -sum(os.times()[2:4])  # netconvert is behind us
     print("ready", flush=True)
     for line in sys.stdin:
@@ -416,10 +514,10 @@ def child(case: str, folder: Path) -> None:
 # All cases
 
 
-def python(*arguments: str) -> subprocess.Popen[str]:
-    """Start this file in a process of its own."""
-    pipe = subprocess.PIPE
-    return subprocess.Popen([sys.executable, __file__, *arguments], stdin=pipe, stdout=pipe, text=True)
+def python(*arguments: str, checkout: Path | None = None) -> subprocess.Popen[str]:
+    """Start this file in a process of its own, with the code of a checkout."""
+    pipe, environment = subprocess.PIPE, os.environ if checkout is None else {**os.environ, "PYTHONPATH": str(checkout)}
+    return subprocess.Popen([sys.executable, __file__, *arguments], stdin=pipe, stdout=pipe, text=True, env=environment)
 
 
 def told(process: subprocess.Popen[str], what: str) -> None:
@@ -436,9 +534,11 @@ def place(root: Path, case: str, trains: int) -> Path:
     folder, steps = root / f"{case}-{trains}", steps_of(case, trains)
     if not folder.exists():
         folder.mkdir()
-        text, line = scenario(case, trains, steps + 2)
+        text, line = scenario(case, trains, steps + 2 + BEFORE.get(case, 0))
         (folder / "scenario.toml").write_text(text, encoding="utf-8")
         (folder / "line.toml").write_text(line, encoding="utf-8")
+        if case == "traffic":
+            railway(folder, trains)
         if case in ALONE:
             process = python("--inputs", case, str(folder), str(trains), str(steps))
             process.communicate()
@@ -454,22 +554,60 @@ def place(root: Path, case: str, trains: int) -> Path:
 def together(root: Path, cases: list[str], trains: int) -> dict[str, dict[str, Any]]:
     """One repeat of these cases, which take turns every few steps."""
     running = {case: python("--case", case, str(place(root, case, trains))) for case in cases}
+    return by_turns(running, {case: steps_of(case, trains) for case in cases})
+
+
+def by_turns(running: dict[str, subprocess.Popen[str]], steps: dict[str, int]) -> dict[str, dict[str, Any]]:
+    """Let processes do so many steps each, every few steps the next one; what they tell at the end."""
     for process in running.values():
         told(process, "ready")
     for slice_ in range(SLICES + 1):  # the last one closes
-        for case, process in running.items():
+        for name, process in running.items():
             assert process.stdin is not None
-            steps = steps_of(case, trains)
-            share = steps * (slice_ + 1) // SLICES - steps * slice_ // SLICES if slice_ < SLICES else 0
+            share = steps[name] * (slice_ + 1) // SLICES - steps[name] * slice_ // SLICES if slice_ < SLICES else 0
             if share or slice_ == SLICES:
                 process.stdin.write(f"{share}\n")
                 process.stdin.flush()
                 told(process, "done")
     found = {}
-    for case, process in running.items():
+    for name, process in running.items():
         said, _ = process.communicate()
-        found[case] = {"steps": steps_of(case, trains), **json.loads(said.splitlines()[-1])}
+        found[name] = {"steps": steps[name], **json.loads(said.splitlines()[-1])}
     return found
+
+
+def compared(root: Path, checkout: Path, sizes: list[int], cases: list[str], pairs: int) -> list[dict[str, Any]]:
+    """Rows of how long this checkout takes over how long another one does, for all cases at all sizes."""
+    code, rows = {"here": HERE, "there": checkout}, []
+    for name in code:
+        (root / name).mkdir()
+    for trains in sizes:
+        for case in cases:
+            found = []
+            for turn in range(pairs):
+                print(f"{trains} trains, {case}: pair {turn + 1} of {pairs}", file=sys.stderr)
+                folders = {name: place(root / name, case, trains) for name in (code if turn % 2 else reversed(code))}
+                running = {
+                    name: python("--public", case, str(folder), str(code[name]), checkout=code[name])
+                    for name, folder in folders.items()
+                }
+                found.append(by_turns(running, dict.fromkeys(running, steps_of(case, trains))))
+            rows.append(paired(case, trains, found))
+    return rows
+
+
+def paired(case: str, trains: int, pairs: list[dict[str, dict[str, Any]]]) -> dict[str, Any]:
+    """Median, least and greatest of the ratios within the pairs of one case."""
+    ratios = [pair["here"]["seconds"] / pair["there"]["seconds"] for pair in pairs]
+    cpu = [pair["here"]["cpu"] / pair["there"]["cpu"] for pair in pairs]
+    scale = 1e6 / trains
+    typical = {name: statistics.median(p[name]["seconds"] / p[name]["steps"] * scale for p in pairs) for name in ("here", "there")}
+    return {
+        "case": case, "trains": trains, "pairs": len(pairs), "ratio": round(statistics.median(ratios), 3),
+        "least_ratio": round(min(ratios), 3), "greatest_ratio": round(max(ratios), 3),
+        "cpu_ratio": round(statistics.median(cpu), 3),
+        "here_us": round(typical["here"], 3), "there_us": round(typical["there"], 3),
+    }  # fmt: skip
 
 
 def bench(root: Path, sizes: list[int], cases: list[str], repeats: int) -> list[dict[str, Any]]:
@@ -549,7 +687,9 @@ def table(rows: list[dict[str, Any]]) -> str:
     named = {
         "case": "case", "trains": "trains", "instructions": "instructions", "us_per_train_step": "us/train-step",
         "ratio_to_bare": "to bare", "cpu_us_per_train_step": "CPU us", "cpu_ratio_to_bare": "CPU to bare",
-        "times_real_time": "x real time", "peak_mb": "peak MB", **{f"{p}_us": p for p in PARTS},
+        "times_real_time": "x real time", "peak_mb": "peak MB", **{f"{p}_us": p for p in PARTS}, "pairs": "pairs",
+        "ratio": "here/there", "least_ratio": "least", "greatest_ratio": "greatest", "cpu_ratio": "CPU here/there",
+        "here_us": "here us/train-step", "there_us": "there us/train-step",
     }  # fmt: skip
     columns = [c for c in named if c in rows[0]]
     lines = [[named[c] for c in columns], *(["" if r[c] is None else str(r[c]) for c in columns] for r in rows)]
@@ -569,24 +709,38 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="What closing the loop costs beside SUMO alone.")
     parser.add_argument("--trains", type=int, action="append", help="number of trains; repeatable; default 10, 100, 1000, 10000")
     parser.add_argument("--only", action="append", choices=[*IN_SUMO, *NUMERIC], help="this case; repeatable; default all")
-    parser.add_argument("--repeats", type=int, default=3, help="repeats of each case; the median is told")
+    parser.add_argument("--repeats", type=int, help="repeats of each case, default 3; of pairs, default 10; the median is told")
+    parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="compare with the code there; default 1000 trains")
     parser.add_argument("--instructions", action="store_true", help="count instructions with valgrind: repeatable, but slow")
     parser.add_argument("--json", action="store_true", help="print a list of rows for machines")
     parser.add_argument("--case", nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument("--public", nargs=3, help=argparse.SUPPRESS)
     parser.add_argument("--inputs", nargs=4, help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.inputs:
         case, folder, trains, steps = asked.inputs
         inputs(Path(folder), case, int(trains), int(steps))
     elif asked.case:
-        child(asked.case[0], Path(asked.case[1]))
+        case, folder = asked.case
+        child(case, Path(folder), client if case == "client" else alone if case in ALONE else closed)
+    elif asked.public:
+        case, folder, checkout = asked.public
+        of_this(Path(checkout))
+        child(case, Path(folder), public)
     else:
         with tempfile.TemporaryDirectory(prefix="trainctl-bench-") as root:
             sizes, cases = asked.trains or list(SIZES), asked.only
-            if asked.instructions:
+            if asked.against:
+                wrong = [case for case in cases or () if case not in OURS]
+                if wrong or not (asked.against / "trainctl").is_dir():
+                    parser.error(f"--only {wrong[0]}: has no loop of ours" if wrong else f"--against {asked.against}: no checkout")
+                rows = compared(
+                    Path(root), asked.against.resolve(), asked.trains or [1000], cases or list(OURS), asked.repeats or 10
+                )
+            elif asked.instructions:
                 rows = counted(Path(root), asked.trains or [1000], cases or ["bare", "rail", "loop"])
             else:
-                rows = bench(Path(root), sizes, cases or [*IN_SUMO, *NUMERIC], asked.repeats)
+                rows = bench(Path(root), sizes, cases or [*IN_SUMO, *NUMERIC], asked.repeats or 3)
         print(json.dumps(rows, indent=2) if asked.json else table(rows))
 
 

@@ -99,7 +99,7 @@ def test_backends_agree_where_trains_come_join_and_leave(tmp_path):
 
 def test_three_joins_one_after_the_other(tmp_path):
     nets.three_joins(tmp_path)
-    found = go(tmp_path, nets.scenario("robust_constrained", 2800))
+    found = go(tmp_path, nets.scenario("robust_constrained", 2150))
     unharmed(found)
     assert kinds(found)["couple"] >= 8
     pairs = [(e["train"], e["ahead"]) for e in found.events if e["kind"] == "couple"]
@@ -110,21 +110,21 @@ def test_three_joins_one_after_the_other(tmp_path):
 def test_opposing_trains_meet_in_passing_loops(tmp_path, period):
     up = nets.flow("up", nets.UP, 3, period, departSpeed="0")
     nets.single_track(tmp_path, up + nets.flow("down", nets.DOWN, 3, period, 20, departSpeed="0"))
-    found = go(tmp_path, nets.scenario("robust_constrained", 3000))
+    found = go(tmp_path, nets.scenario("robust_constrained", 2000))
     unharmed(found)
     assert any(e["kind"] == "conflict" and e["place"] == "single_track" for e in found.events)
 
 
 def test_two_lines_cross_on_the_level(tmp_path):
     nets.diamond(tmp_path)
-    found = go(tmp_path, nets.scenario("robust_constrained", 1100))
+    found = go(tmp_path, nets.scenario("robust_constrained", 900))
     unharmed(found)
     assert kinds(found)["conflict"] > 0
 
 
 def test_a_train_that_stops_leaves_its_formation_and_another_joins(tmp_path):
     nets.station(tmp_path)
-    found = go(tmp_path, nets.scenario("robust_constrained", 2000))
+    found = go(tmp_path, nets.scenario("robust_constrained", 1650))
     unharmed(found)
     stops = {e["train"]: e for e in found.events if e["kind"] == "stop_reached"}
     left = {e["train"]: e["time_s"] for e in found.events if e["kind"] == "stop_left"}
@@ -193,7 +193,7 @@ def test_trains_run_round_a_ring_twice(tmp_path):
 @pytest.mark.parametrize("law", ["fully_distributed", "robust_constrained"])
 def test_a_formation_follows_the_limits_as_long_as_its_law_can(tmp_path, law):
     nets.limits(tmp_path)
-    found = go(tmp_path, nets.scenario(law, 2400))
+    found = go(tmp_path, nets.scenario(law, 2200))
     unharmed(found)
     for edge, limit in (("bc", 34.5), ("de", 20.0)):
         rows = found.trains[found.trains.edge.astype(str) == edge]
@@ -245,7 +245,7 @@ def test_only_those_that_cooperate_couple(tmp_path):
 
 def test_fifty_trains_of_two_lengths_couple_and_arrive(tmp_path):
     nets.crowd(tmp_path)
-    tables = nets.scenario("robust_constrained", 3800, types=("emu", "long"))
+    tables = nets.scenario("robust_constrained", 3050, types=("emu", "long"))
     tables["train_type"]["long"] = tables["train_type"]["long"] | {"unit_length_m": 250.0}
     found = go(tmp_path, tables)
     unharmed(found)

@@ -9,10 +9,10 @@ from typing import Any
 import nets
 import pytest
 import tomli_w
-from trainctl.prepare import open_scenario
 
 import trainctl
 from trainctl.runner import run
+from trainctl.scenario.build import open_scenario
 
 #: The first train brakes, the second pulls, whatever is ahead.
 LAW = '''

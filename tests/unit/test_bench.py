@@ -11,13 +11,15 @@ from pathlib import Path
 
 import pytest
 
+import trainctl
+
 FILE = Path(__file__).resolve().parents[2] / "tools" / "bench.py"
 spec = importlib.util.spec_from_file_location("bench", FILE)
 bench = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(bench)
 
 
-@pytest.mark.parametrize("case", [*bench.IN_SUMO, *bench.NUMERIC])
+@pytest.mark.parametrize("case", sorted({*bench.IN_SUMO, *bench.NUMERIC} - {"traffic"}))
 def test_scenarios_have_the_trains_they_say_on_edges_of_5_km(case):
     text, line = bench.scenario(case, 100, 50)
     data, net = tomllib.loads(text), tomllib.loads(line)
@@ -25,6 +27,43 @@ def test_scenarios_have_the_trains_they_say_on_edges_of_5_km(case):
     assert {t["track"] for t in data["train"]} == {1, 2, 3}
     assert net["max_edge_m"] == 5000.0
     assert max(t["position_m"] for t in data["train"]) + 50 * 90 < net["length_m"]
+
+
+def test_trains_of_the_traffic_case_come_merge_and_couple(tmp_path):
+    text, _ = bench.scenario("traffic", 11, 300)
+    (tmp_path / "scenario.toml").write_text(text)
+    bench.railway(tmp_path, 11)
+    run = trainctl.run(tmp_path / "scenario.toml", backend="numeric", out=tmp_path / "run")
+    came = {e["train"]: e["time_s"] for e in run.events if e["kind"] == "depart"}
+    assert sorted(came, key=int) == [str(k) for k in range(11)]
+    assert max(came.values()) <= bench.BEFORE["traffic"]
+    pairs = {(int(e["train"]), int(e["ahead"])) for e in run.events if e["kind"] == "couple"}
+    assert any((a - b) % 2 for a, b in pairs) and all(a // bench.PER_PIECE == b // bench.PER_PIECE for a, b in pairs)
+
+
+def test_ratios_are_those_within_a_pair():
+    def result(seconds):
+        return {"steps": 10, "seconds": seconds, "cpu": 2.0 * seconds}
+
+    pairs = [{"here": result(a), "there": result(b)} for a, b in ((2.0, 1.0), (3.0, 4.0), (8.0, 10.0))]
+    row = bench.paired("loop", 1000, pairs)
+    assert (row["ratio"], row["least_ratio"], row["greatest_ratio"], row["cpu_ratio"]) == (0.8, 0.75, 2.0, 0.8)
+    assert (row["here_us"], row["there_us"]) == (300.0, 400.0)
+
+
+def test_two_checkouts_are_compared_each_with_its_own_code(tmp_path):
+    here = FILE.parents[1]
+    command = [sys.executable, FILE, "--trains", "6", "--only", "supervised", "--repeats", "1", "--json", "--against"]
+    done = subprocess.run([*command, here], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    [row] = json.loads(done.stdout)
+    assert (row["case"], row["trains"], row["pairs"]) == ("supervised", 6, 1)
+    assert 0.2 < row["ratio"] < 5.0
+    (tmp_path / "trainctl").mkdir()  # another trainctl: it has no Simulation
+    (tmp_path / "trainctl" / "__init__.py").touch()
+    done = subprocess.run([*command, tmp_path], capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "has no attribute 'Simulation'" in done.stderr
 
 
 def test_time_inside_a_part_is_not_that_of_the_part_around_it(monkeypatch):

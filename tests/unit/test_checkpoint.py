@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import json
+import shutil
+from collections import deque
+from contextlib import closing
 from pathlib import Path
 
+import nets
 import numpy as np
 import pytest
+import tomli_w
 
 from trainctl.errors import InputError
+from trainctl.loop import Simulation
 from trainctl.numeric import Numeric
 from trainctl.record import checkpoint
 from trainctl.record.checkpoint import Saved, Tape, leaves, refill
@@ -16,6 +22,7 @@ from trainctl.record.folder import claim, free, held, ours, remove, write_info
 from trainctl.runner import again, begin, opened
 from trainctl.scenario.build import open_scenario
 from trainctl.signals import Demand, Start
+from trainctl.stages.record import Journal
 
 
 class Deaf(Numeric):
@@ -149,6 +156,102 @@ def test_every_array_of_trains_that_come_and_go_is_in_a_checkpoint(tmp_path):
         assert lost == {"roster", "cruise", "assumed"}  # as they were read
         lookout = {name for name, value in vars(simulation.lookout).items() if list(leaves("x", value))}
         assert lookout == {"net", "length", "factor", "ways", "zones", "waits_for", "assumed", "rate"}
+
+
+#: Data that does not change; what is outside; functions; written anew in every step before it is read; made of the world's ways.
+NOT_STATE = {"p", "world", "journal", "between", "parts", "stops", "held", "ways", "zones"}
+
+
+def remembered(name, thing):
+    """All numbers, words and arrays an object of ours holds, and those of all objects in it, with their places."""
+    if thing is None or isinstance(thing, bool | int | float | str | np.generic):
+        yield name, thing
+    elif isinstance(thing, np.ndarray):
+        yield name, thing.copy()
+    elif isinstance(thing, dict):
+        yield f"{name}, keys", str(sorted(thing, key=str))
+        for key, value in thing.items():
+            yield from remembered(f"{name}[{key}]", value)
+    elif isinstance(thing, tuple | list | deque):
+        yield f"{name}, length", len(thing)
+        for k, value in enumerate(thing):
+            yield from remembered(f"{name}[{k}]", value)
+    elif type(thing).__module__.startswith("trainctl.") and hasattr(thing, "__dict__"):
+        for key, value in vars(thing).items():
+            if key not in NOT_STATE:
+                yield from remembered(f"{name}.{key}", value)
+
+
+def same(one, two):
+    if isinstance(one, np.ndarray) and isinstance(two, np.ndarray):
+        return one.dtype == two.dtype and one.shape == two.shape and one.tobytes() == two.tobytes()
+    return type(one) is type(two) and (one == two or one != one)
+
+
+#: Scenario, changes, and the steps after which it is busy: much is under way, or has come to be otherwise than at the start.
+BUSY = {
+    "units": ("three_tracks", {"supervisor.mode": "on", "topology.loss": 0.3, "run.seed": 1}, (150,)),
+    "actuators": (
+        "fault_tolerant_noise", {"topology.communication_period_s": 0.5, "topology.loss": 0.2, "topology.delay_s": 1.0}, (5,)
+    ),
+    "points": ("fully_distributed_loss", {"topology.delay_s": 2.0}, (1010,)),
+    "formations, stops": ("merging", {}, (300, 600, 670, 760, 955)),
+    "single track": ("", {}, (300,)),
+}  # fmt: skip
+
+
+#: What must have changed since the start, or nothing would be seen of it.
+CHANGED = {
+    "units": ("acting", "outside", "heard", "extremes", "alarms.count"),
+    "actuators": ("air[3]", "counted", "estimate", "exchange.sent"),
+    "points": ("pending", "ever", "formation", "exchange.sent"),
+    "formations, stops": (
+        "claims", "came", "left", "next_stop", "stands_until", "stopping", "stops_soon", "halted", "ask_at", "parted", "refused",
+        "slot", "offset", "service.pace[2]",
+    ),
+    "single track": ("waits_for", "claims"),
+}  # fmt: skip
+
+
+def lost(expected, found):
+    return [place for place in expected | found if not same(expected.get(place), found.get(place))]
+
+
+def from_checkpoint(p, folder):
+    """What a simulation remembers that comes from the checkpoint in a folder."""
+    saved = checkpoint.read(folder, p)
+    with closing(Tape(Numeric(p.line), folder, saved)) as tape:
+        simulation = Simulation(p, tape, checkpoint.Unheard())
+        checkpoint.restore(simulation, tape, saved)
+        return dict(remembered("simulation", simulation))
+
+
+@pytest.mark.parametrize("case", BUSY)
+def test_a_simulation_that_goes_on_from_a_checkpoint_remembers_all_that_one_does_which_went_on(case, tmp_path):
+    name, changes, steps = BUSY[case]
+    if case == "single track":
+        name = str(tmp_path / "s.toml")
+        up = nets.flow("up", nets.UP, 2, 60, departSpeed="0")
+        nets.single_track(tmp_path, up + nets.flow("down", nets.DOWN, 2, 60, 20, departSpeed="0"))
+        (tmp_path / "s.toml").write_text(tomli_w.dumps(nets.scenario("robust_constrained", 900)))
+    p = open_scenario(name, changes)
+    with closing(Journal(tmp_path, p)) as journal, closing(Tape(Numeric(p.line), tmp_path)) as tape:
+        went_on, changed = Simulation(p, tape, journal), set()
+        begun = dict(remembered("simulation", went_on))
+        for k in range(steps[-1]):
+            if case == "units" and k == 20:
+                went_on.outside[:] = -5.0, *[5.0] * 5  # so that the supervisor has to act
+            went_on.step()
+            if went_on.k in steps:
+                place = tmp_path / str(went_on.k)
+                place.mkdir()
+                checkpoint.write(place, went_on, {**checkpoint.identity(p), "tape": tape.save()})
+                shutil.copy(tmp_path / "moves.bin", place)
+                expected = dict(remembered("simulation", went_on))
+                assert lost(expected, from_checkpoint(p, place)) == []
+                changed |= {name for name in expected if name in lost(begun, expected)}
+    assert len(expected) > 60
+    assert [name for name in CHANGED.get(case, []) if not any(name in place for place in changed)] == []
 
 
 @pytest.mark.parametrize("own_line", [False, True])

@@ -9,8 +9,14 @@ import numpy as np
 import pytest
 import tomli_w
 
+from trainctl.railway import supervisor
+from trainctl.railway.along import Ahead
+from trainctl.railway.authority import View
+from trainctl.railway.supervisor import Limits
 from trainctl.scenario.build import Prepared, open_scenario
-from trainctl.stages.convoys import Service
+from trainctl.signals import POSITION, SPEED, Seen
+from trainctl.stages.convoys import HASTE, ROOM_FOR_HASTE, Service
+from trainctl.topology.convoys import closing_speed
 
 
 @pytest.fixture(scope="module")
@@ -77,3 +83,63 @@ def test_nothing_but_a_chain_counts_as_led(line):
     assert not service.led.any()
     service.ahead[1] = 0
     assert np.flatnonzero(service.led).tolist() == [0, 1]
+
+
+class Told(list):
+    """A journal of events by kind."""
+
+    def event(self, time, kind, **fields):
+        self.append((kind, fields.get("train")))
+
+
+def view(ahead, spacing, limits=None):
+    """What is ahead of trains that nothing else is in the way of."""
+    n, nothing = len(ahead), supervisor.no_targets()
+    return View(
+        Ahead(np.array(ahead), np.array(spacing)), nothing, nothing, limits or supervisor.no_limits(), np.full(n, np.inf),
+        np.full(n, -1),
+    )  # fmt: skip
+
+
+def side_by_side(p, spacings, speed):
+    """Every train on the net, each so far behind the one before."""
+    own, n = p.own.copy(), len(p.scenario.ids)
+    own[p.heads, POSITION], own[:, SPEED] = -np.cumsum([0.0, *spacings]), speed
+    nowhere = np.zeros(n, np.int64)
+    return Seen(own[p.heads, POSITION].copy(), nowhere, nowhere, np.ones(n, bool)), own
+
+
+def coupled(p, limits):
+    """Whether the second of two trains that are right for it couples where these limits are ahead."""
+    n, told = len(p.scenario.ids), Told()
+    seen, own = side_by_side(p, [1200.0] + [9000.0] * (n - 2), 35.0)
+    Service(p).couple(0.0, seen, own, view([-1, 0] + [-1] * (n - 2), [np.inf, 1200.0] + [np.inf] * (n - 2), limits), told)
+    return told
+
+
+def test_trains_that_must_soon_run_slower_than_a_formation_can_do_not_couple(line):
+    p = prepared(line, "fully_distributed")
+    ids = p.scenario.ids
+    assert coupled(p, None) == [("couple", ids[1])]
+    for who in (0, 1):  # the one ahead, or the one that would couple
+        for distance, speed, couples in ((500.0, 20.0, False), (2000.0, 20.0, False), (2200.0, 20.0, True), (500.0, 39.0, True)):
+            limits = Limits(np.array([who]), np.array([distance]), np.array([speed]))  # 60 s ahead are 2100 m
+            assert (coupled(p, limits) == [("couple", ids[1])]) is couples, (who, distance, speed)
+
+
+def test_a_train_catches_up_no_faster_than_it_is_told_to(line):
+    """At most catch_up_mps above the cruising speed, half of that where one behind is nearer to joining, and within its bounds."""
+    for most, room in ((1.0, 3.0), (3.0, 3.0)):
+        p = prepared(line, "robust_constrained", traffic={"catch_up_mps": most})
+        n = len(p.scenario.ids)
+        service, (seen, _) = Service(p), side_by_side(p, [9000.0] * (n - 1), 35.0)
+        allowed = min(most, ROOM_FOR_HASTE * room)
+        v = np.full(n, 35.0)
+        first, far, near = [-1, 0, 1] + [-1] * (n - 3), 9000.0, 1220.0
+        nothing = [np.inf] * (n - 3)
+        wish = service._wish(seen, v, view(first, [np.inf, far, far, *nothing]))
+        np.testing.assert_allclose(wish[:3] - 35.0, [0.0, allowed, allowed], atol=1e-12)
+        wish = service._wish(seen, v, view(first, [np.inf, far, near, *nothing]))  # the third is nearer to joining the second
+        closing = float(closing_speed(np.array([20.0]))[0])
+        np.testing.assert_allclose(wish[:3] - 35.0, [0.0, min(HASTE * most, ROOM_FOR_HASTE * room), closing], atol=1e-12)
+        assert HASTE * most < allowed or most == 3.0

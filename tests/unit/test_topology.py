@@ -142,3 +142,21 @@ def test_what_was_heard_stays_with_its_link_when_the_graph_changes():
     }
     assert heard[2, 3] == (2.0, True)
     assert heard[0, 2][1] == np.False_
+
+
+def test_a_link_that_has_received_once_stays_one_whatever_is_lost_and_however_the_graph_changes():
+    """A train that goes by old messages must not take the zeros of a new link for one."""
+    before, after = made(plan(), [1, 1, 1, 1, 2, 1]), made(plan(), [1, 3, 1, 1, 1, 1])
+    exchange = Exchange(0.5, 0, np.inf, 3)
+    received, last = np.zeros(len(before.sender), bool), np.zeros(len(before.sender))
+    for k in range(1, 3):
+        heard = exchange.deliver(10.0 * k + np.arange(6.0)[:, None], np.zeros(6), before, k)
+        received |= heard
+        last[heard] = 10.0 * k + before.sender[heard]
+        np.testing.assert_array_equal(exchange.ever, received)
+    assert (received & ~heard).any() and not received.all()  # some were lost again, some never heard
+    exchange.relink(before, after)
+    old = {(s, r): (e, x) for s, r, e, x in zip(before.sender, before.receiver, received, last, strict=True)}
+    kept = [old.get((s, r), (False, 0.0)) for s, r in zip(after.sender, after.receiver, strict=True)]
+    assert list(zip(exchange.ever.tolist(), exchange.heard[:, 0].tolist(), strict=True)) == kept
+    assert any(e for e, _ in kept) and not all((s, r) in old for s, r in zip(after.sender, after.receiver, strict=True))

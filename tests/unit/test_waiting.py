@@ -6,13 +6,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from trainctl.supervisor import Targets
 
-from trainctl import supervisor
 from trainctl.monitors import waiting
 from trainctl.monitors.outcome import Tally
 from trainctl.monitors.waiting import SWITCH, TRAIN, Wait, Waiting, circles
-from trainctl.world import Seen
+from trainctl.railway import supervisor
+from trainctl.railway.supervisor import Targets
+from trainctl.signals import Seen
 
 
 def waits(*pairs):
