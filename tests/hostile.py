@@ -8,8 +8,12 @@ from __future__ import annotations
 
 import math
 import random
+import re
 import shutil
+import tempfile
 import time
+import traceback
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,14 +38,16 @@ CONTINUOUS = (
     "first_brakes", "first_brakes", "full", "nan",
 )
 
+Plants = tuple[tuple[str, bool, int], ...]
+
 #: Plant, whether a continuous law drives, and how often.
-PLANTS = (
+PLANTS: Plants = (
     ("point", False, 30), ("clamped", False, 30), ("coupled_units", False, 12), ("coupled_units", True, 8),
     ("actuated_units", False, 5), ("actuated_units", True, 15),
 )  # fmt: skip
 
 #: Those that need no kernel compiled beyond the package's own.
-QUICK = tuple((kind, law, weight) for kind, law, weight in PLANTS if kind in ("point", "clamped"))
+QUICK: Plants = tuple((kind, law, weight) for kind, law, weight in PLANTS if kind in ("point", "clamped"))
 
 GRAVITY = 9.80665
 
@@ -58,8 +64,9 @@ class Case(NamedTuple):
 class Outcome(NamedTuple):
     """What became of a run."""
 
-    what: str  # "done", "refused", "died" (exit 3, in words)
+    what: str  # "done", "refused", "died" (exit 3, in words), "crashed"
     words: str  # why it was refused or died
+    may_die: bool
     found: Findings | None
     told: bool  # whether the program itself told of trains inside one another
     collisions: int  # in SUMO's log
@@ -71,6 +78,8 @@ class Outcome(NamedTuple):
         """What must not be, in words."""
         found = self.found
         bad = [] if found is None else [f"{kind}: {words}" for kind, words in zip(found._fields, found, strict=True) if words]
+        if self.what == "crashed" or (self.what == "died" and not self.may_die):
+            bad.append(f"{self.what}: {self.words}")
         if self.collisions:
             bad.append(f"collisions: {self.collisions} in SUMO's log")
         if found is not None and found.overlap and not self.told:
@@ -210,7 +219,7 @@ def base(draw: random.Random, seed: int, kind: str, continuous: bool) -> dict[st
     return tables
 
 
-def drawn(seed: int, place: Path, plants: tuple[tuple[str, bool, int], ...] = PLANTS, sumo: bool = False) -> Case:
+def drawn(seed: int, place: Path, plants: Plants = PLANTS) -> Case:
     """Draw a case into ``place/SEED``; nets are laid once into ``place/nets``."""
     draw = random.Random(f"hostile {seed}")
     folder = place / str(seed)
@@ -299,9 +308,13 @@ def railway(draw: random.Random, place: Path) -> tuple[str, Path, list[str]]:
     lay, variants = NETS[name]
     variant = draw.randrange(variants)
     folder = place / "nets" / f"{name}.{variant}"
-    if not (folder / "routes").is_file():
-        routes = lay(folder, random.Random(f"{name} {variant}"))
-        (folder / "routes").write_text("\n".join(routes))
+    if not folder.is_dir():
+        folder.parent.mkdir(exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent) as work:
+            routes = lay(Path(work) / "net", random.Random(f"{name} {variant}"))
+            (Path(work) / "net" / "routes").write_text("\n".join(routes))
+            with suppress(OSError):  # another process was faster
+                (Path(work) / "net").rename(folder)
     return f"{name}.{variant}", folder / "a.net.xml", (folder / "routes").read_text().splitlines()
 
 
@@ -343,6 +356,7 @@ def net_case(draw: random.Random, place: Path, folder: Path, tables: dict[str, A
         if draw.random() < 0.2:
             stop = f'<stop lane="{route.split()[-1]}_0" endPos="{draw.uniform(300.0, 1500.0):.0f}" duration="{draw.randint(5, 60)}"/>'
         more = " ".join(f'{k}="{v}"' for k, v in said.items())
+        depart = min(depart, 0.6 * duration)
         rows.append(f'<vehicle id="{i}" depart="{depart:.0f}" {more}><route edges="{route}"/>{stop}</vehicle>')
         depart += draw.choice([0.0, draw.uniform(0.0, 30.0), draw.uniform(10.0, 80.0)])
     types = "".join(f'<vType id="{k}" vClass="rail" length="{t.length}" maxSpeed="45"/>' for k, t in trains.items())
@@ -390,7 +404,7 @@ def driven(case: Case, mode: str = "on", backend: str = "numeric") -> Outcome:
     try:
         p = opened(case, mode)
     except InputError as error:
-        return Outcome("refused", str(error), None, False, 0, 0, time.perf_counter() - began)
+        return Outcome("refused", str(error), True, None, False, 0, 0, time.perf_counter() - began)
     recording, journal = Recording(p), Deaf()
     what, words, collisions = "done", "", 0
     world = None
@@ -412,6 +426,9 @@ def driven(case: Case, mode: str = "on", backend: str = "numeric") -> Outcome:
         what, words = "refused", f"on the way: {error}"
     except TrainctlError as error:
         what, words = "died", f"{type(error).__name__}: {error}"
+    except Exception as error:  # whatever it is, it is not what a user should see
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        what, words = "crashed", f"{error!r} in {Path(last.filename).name}, line {last.lineno}"
     finally:
         if world is not None:
             world.close()
@@ -420,4 +437,16 @@ def driven(case: Case, mode: str = "on", backend: str = "numeric") -> Outcome:
         collisions = log.read_text().count("<collision ")
     steps = len(recording.rows) - 1
     found = judge(p, recording.tracks()) if recording.rows else None
-    return Outcome(what, words, found, journal.told, collisions, steps, time.perf_counter() - began)
+    may_die = mode == "off" or case.tables["controller"]["style"] == "nan"
+    return Outcome(what, words, may_die, found, journal.told, collisions, steps, time.perf_counter() - began)
+
+
+def reason(words: str) -> str:
+    """The key that a refusal names, without the numbers and the names of trains."""
+    first = words.splitlines()[0].removeprefix("s.toml: ")
+    return re.sub(r"\[[^\]]*\]", "[]", re.split(r" = |: ", first)[0])[:60]
+
+
+def forget(case: Case) -> None:
+    """Remove a case's folder."""
+    shutil.rmtree(case.folder)
