@@ -28,6 +28,7 @@ from trainctl.errors import InputError
 from trainctl.prepare import open_scenario
 from trainctl.reading import mistakes
 from trainctl.record import run as recorded
+from trainctl.record.outcome import summary
 from trainctl.runner import Backend
 from trainctl.scenario import Event
 from trainctl.signals import POSITION, SPEED, Floats
@@ -73,6 +74,11 @@ def run(
     **settings
         Keys of the scenario to override: ``**{"run.duration_s": 60}``.
 
+    Returns
+    -------
+    Run
+        Also of a run in which trains collided or locked each other: see ``Run.ok`` and ``Run.collisions``.
+
     Raises
     ------
     InputError
@@ -91,7 +97,10 @@ def open(folder: str | Path) -> Run:
 
 
 class Run(recorded.Run):
-    """A run folder in a notebook: tables as DataFrames (``trains``, ``units``, ``links``), ``events``, ``metrics``, ``plot``."""
+    """A run folder in a notebook: tables as DataFrames (``trains``, ``units``, ``links``), ``events``, ``metrics``, ``plot``.
+
+    ``ok`` says whether anything failed the run, ``collisions`` how many pairs of trains collided.
+    """
 
     @cached_property
     def plot(self) -> Plots:
@@ -106,6 +115,8 @@ class Run(recorded.Run):
                 ("scenario", self.scenario["title"]),
                 ("law, plant", f"{law} on {plant}, {len(self.scenario['train'])} trains"),
             ]
+        if "violations" in self.info:
+            rows += [(line.title, f"FAILED: {line.text}" if line.failed else line.text) for line in summary(self)]
         if (self.folder / "metrics.json").is_file():
             known = ((words, self.metrics.get(key)) for key, words in HEADLINES.items())
             rows += [(words, f"{value:.6g}") for words, value in known if isinstance(value, int | float)]

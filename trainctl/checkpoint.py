@@ -174,6 +174,10 @@ class Tape:
         """Warnings the simulator gave."""
         return self.world.messages()
 
+    def collisions(self) -> list[dict[str, Any]]:
+        """Collisions the simulator counted."""
+        return self.world.collisions()
+
 
 def _by_step(told: list[Any]) -> dict[int, list[Any]]:
     """What was told before each step: (step, train, what) by step."""

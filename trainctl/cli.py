@@ -103,7 +103,10 @@ def run(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no summary.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Run a scenario into a run folder: logs, metrics, SUMO's own logs."""
+    """Run a scenario into a run folder: logs, metrics, SUMO's own logs.
+
+    Exit 1 if trains collided or waited for each other in a circle; with the supervisor on also if one was too fast for its line.
+    """
     from trainctl import runner
 
     if gui and backend == "numeric":
@@ -119,7 +122,7 @@ def run(
         _print_json({"folder": str(folder), **done.info, "metrics": done.metrics})
     elif shown:
         _summary(done, prepared)
-    if strict and done.info["violations"]:
+    if not done.ok or (strict and done.info["violations"]):
         raise typer.Exit(1)
 
 
@@ -148,6 +151,8 @@ class _progress:
 
 def _summary(done: Run, prepared: Prepared) -> None:
     """Where the results lie, and whether the bounds held."""
+    from trainctl.record.outcome import summary
+
     info, metrics = done.info, done.metrics
     print(prepared.scenario.title)
     table = _table(None, "", "")
@@ -169,11 +174,8 @@ def _summary(done: Run, prepared: Prepared) -> None:
     ):
         if isinstance(metrics.get(key), int | float):
             table.add_row(words, f"{metrics[key]:.6g} {unit}")
-    broken = info["violations"]
-    where = ""
-    if first := info.get("first_violation"):
-        where = f", first {first['bound']} of {first['who']} at {first['time_s']:g} s"
-    table.add_row("bounds", "all held" if not broken else f"{broken} broken{where}: see kind = violation in events.jsonl")
+    for line in summary(done):
+        table.add_row(line.title, f"FAILED: {line.text}" if line.failed else line.text)
     table.add_row("results", f"{done.folder}/  (trainctl plot {done.folder}; trainctl metrics {done.folder})")
     _print(table)
     for note in () if prepared.roster is None else prepared.roster.notes:
@@ -212,9 +214,11 @@ def check(name: ScenarioName = DEFAULT_SCENARIO, settings: Settings = None, as_j
     table = _table(None, "", "")
     table.show_header = False
     for key, value in found.items():
-        if key not in ("warnings", "report", "analysis"):
+        if key not in ("warnings", "report", "analysis", "protection", "promise"):
             table.add_row(key, str(value))
     _print(table)
+    for k, line in enumerate(found.get("promise", ())):
+        print(f"protection: {line}" if not k else f"  - {line}")
     for line in found["report"]:
         print(line)
     for line in found["warnings"]:

@@ -22,9 +22,10 @@ def resume(
 ) -> None:
     """Go on with a run that was killed, from its last checkpoint (`trainctl run --checkpoint-every S`).
 
-    It ends with the same files as a run that was not killed. Without checkpoints it begins again.
+    It ends with the same files, and the same exit code, as a run that was not killed. Without checkpoints it begins again.
     """
     from trainctl import cli, runner
+    from trainctl.record.outcome import summary
 
     shown = not (quiet or as_json)
     with cli._progress(folder.name.removesuffix(".partial"), shown and sys.stderr.isatty()) as advance:
@@ -39,7 +40,7 @@ def resume(
         else:
             how = "there was no checkpoint: run again from the beginning"
         print(f"{done.folder}: complete, {done.info['steps']} steps ({how})")
-        if done.info["violations"]:
-            print(f"{done.info['violations']} bounds broken: see kind = violation in events.jsonl")
-    if strict and done.info["violations"]:
+        for line in summary(done):
+            print(f"{'FAILED: ' if line.failed else ''}{line.title}: {line.text}")
+    if not done.ok or (strict and done.info["violations"]):
         raise typer.Exit(1)

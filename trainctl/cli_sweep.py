@@ -48,8 +48,8 @@ def register(app: typer.Typer) -> None:
     ) -> None:
         """Run a scenario with many settings and seeds, on all cores or a cluster, into one Parquet dataset.
 
-        OUT gets results.parquet (one row per run: parameters, status, metrics), summary.png and sweep.json. Exit 3 if runs failed;
-        the others are there all the same.
+        OUT gets results.parquet (one row per run: parameters, status, what was broken, metrics), summary.png and sweep.json. Exit 3
+        if runs failed; the others are there all the same. A collision is a result of its run, not a failed run.
         """
         from trainctl import sweep as sweeping
         from trainctl.cli import _print_json
@@ -139,6 +139,9 @@ def _summary(folder: Path, info: dict[str, Any]) -> None:
         _print(table)
     if len(rows) > 40:
         print(f"and {len(rows) - 40} more combinations")
+    for key, words in (("with_collisions", "trains collided"), ("with_gridlocks", "trains waited for each other in a circle")):
+        if info[key]:
+            print(f"in {info[key]} of {info['complete']} runs {words}")
     for reason in info["reasons"]:
         print(reason)
     print(f"results: {folder}/  (results.parquet, summary.png)")

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from trainctl import promise
 from trainctl.plants import shared
 from trainctl.prepare import Prepared
 from trainctl.topology import graph
@@ -48,6 +49,9 @@ def facts(p: Prepared) -> dict[str, Any]:
             found["input_room_mps2"] = [round(float(p.bounds.input_lower.max()), 6), round(float(p.bounds.input_upper.min()), 6)]
     else:
         found["sub_step_s"] = scene.sub_step
+    if p.supervision.mode != "off" and p.law.CLOCK != "none":
+        found["protection"] = promise.told(p)
+        found["promise"] = promise.sentences(found["protection"])
     notes = [] if p.roster is None else list(p.roster.notes)
     found["warnings"] = notes + list(p.law.warnings(p.params, scene, p.start_track)) if hasattr(p.law, "warnings") else notes
     found["report"] = list(p.law.report(p.params, scene, p.scenario.disturbance)) if hasattr(p.law, "report") else []

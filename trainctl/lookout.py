@@ -9,7 +9,7 @@ from numba import njit
 
 from trainctl.kernels import keep_by_sources
 from trainctl.signals import Bools, Floats, Ints
-from trainctl.supervisor import LIMIT, OPPOSING, SWITCH, TRAIN, Limits, Params, Targets, Verdict, verdict
+from trainctl.supervisor import LIMIT, OPPOSING, SWITCH, TRAIN, Assumed, Limits, Params, Targets, Verdict, verdict
 from trainctl.topology import along
 from trainctl.topology.along import Ahead
 from trainctl.topology.ways import Ways
@@ -129,15 +129,18 @@ def with_targets(targets: Targets, train: Ints, room: Floats, kind: int) -> Targ
     )
 
 
-def judge(params: Params, speed: Floats, targets: Targets, clear: Targets, limits: Limits, step: float, theta: float) -> Verdict:
+def judge(
+    params: Params, speed: Floats, targets: Targets, clear: Targets, limits: Limits, step: float, theta: float, assumed: Assumed,
+    acceleration: Floats,
+) -> Verdict:  # fmt: skip
     """What every train may do: following the one that joins ahead, or keeping the join clear, whichever leaves more.
 
-    ``target`` of the verdict counts rows of ``clear`` on from those of ``targets``.
+    ``target`` of the verdict counts rows of ``clear`` on from those of ``targets``. Arguments as in ``supervisor.verdict``.
     """
-    follows = verdict(params, speed, targets, limits, step, theta)
+    follows = verdict(params, speed, targets, limits, step, theta, assumed, acceleration)
     if targets is clear:
         return follows
-    waits = verdict(params, speed, clear, limits, step, theta)
+    waits = verdict(params, speed, clear, limits, step, theta, assumed, acceleration)
     other = waits.greatest > follows.greatest
     waits = waits._replace(target=waits.target + np.where((waits.reason >= 0) & (waits.reason != LIMIT), len(targets.train), 0))
     return Verdict(
@@ -148,6 +151,14 @@ def judge(params: Params, speed: Floats, targets: Targets, clear: Targets, limit
         target=np.where(other, waits.target, follows.target),
         strongest=follows.strongest,
     )
+
+
+def measured(targets: Targets, limits: Limits, error: Floats) -> tuple[Targets, Limits]:
+    """What trains are told whose positions are measured with an ``error`` (n,), measured minus true position [m]."""
+    other = np.where(targets.other >= 0, error[targets.other], 0.0)
+    ways = np.where(targets.kind == OPPOSING, -other, other)  # the front of one that comes: an error of its own way
+    room = targets.room + ways - error[targets.train]
+    return targets._replace(room=room), limits._replace(distance=limits.distance - error[limits.train])
 
 
 def of(targets: Targets, kept: Bools) -> Targets:

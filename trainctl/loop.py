@@ -14,6 +14,7 @@ import numpy as np
 from trainctl.errors import LawError
 from trainctl.lookout import View
 from trainctl.monitors import bounds as monitor
+from trainctl.monitors import waiting
 from trainctl.motion import Motion, Points, Units
 from trainctl.plants import disturbance
 from trainctl.plants.integrate import Extremes
@@ -82,9 +83,13 @@ class Simulation:
         period = top.communication_period_s or run.control_period_s or run.step_s
         self.exchange = Exchange(loss=top.loss, delay=round(top.delay_s / period), radius=top.range_m or np.inf, seed=run.seed or 0)
         self.motion: Points | Units = Points(prepared) if prepared.scenario.plant.kind == "point" else Units(prepared)
+        noisy = isinstance(self.motion, Units) and self.motion.noise_hold is not None
+        self.disturbing = noisy or bool(len(self.signals.whole))
         self.demand = Demand(np.zeros(n), np.zeros(n, bool))
         self.outside = np.full(n, np.nan)
         self.alarms = monitor.Alarms(prepared)
+        self.kept_out: dict[int, int] = {}  # trains that cannot enter now: because of whom
+        self.not_entered = 0
         self.relinked: tuple[float, Floats, Links] | None = None
         self.between: Callable[[], Any] | None = None
         self._start()
@@ -109,8 +114,9 @@ class Simulation:
         self._check(t, motion)
         self._record(t, seen, before, motion, past, disturbed)
         if view is not None:
-            for alarm in self.alarms.overlaps(t, np.where(seen.present, view.room, np.inf), view.body):
-                self.journal.event(t, "violation", **alarm)
+            speed = before[self.p.heads, SPEED]
+            for kind, told in self.alarms.waits(t, self.world.measure(), speed, view, self.held, self.service, self.kept_out):
+                self.journal.event(t, kind, **told)
         if self.service is not None:
             self.service.advance()
         self.world.move(motion.displacement, self.p.scenario.run.step_s)
@@ -134,6 +140,10 @@ class Simulation:
         if self.service is None:
             self._topology(self.time, seen, None)
         self._record(self.time, seen, self.own, None, self._past(), None)
+        late = [] if self.service is None else self.service.missing(self.time)
+        self.not_entered = len(late)
+        if late:
+            self.journal.event(self.time, "not_entered", trains=late)
 
     def _start(self) -> None:
         p, line, roster = self.p, self.p.line, self.p.roster
@@ -176,8 +186,8 @@ class Simulation:
             return None
         here, ways = self.world.measure(), self.world.ways
         if self.service is None:
-            held = self.lookout.claim(t, ways, here, speed, self.journal, ~here.present)
-            return self.lookout.look(ways, here, speed, held)
+            self.held = self.lookout.claim(t, ways, here, speed, self.journal, ~here.present)
+            return self.lookout.look(ways, here, speed, self.held)
         self.service.arrivals(t, here.present, self.journal)
         overrun = self.motion.overrun(self.own, self.service.rules.service_mps2)
         self.stops = self.service.stops(t, here, speed, overrun, self.journal)
@@ -194,6 +204,7 @@ class Simulation:
         asking = np.zeros(len(speed), bool)
         asking[due] = True
         self.held = self.lookout.claim(t, ways, here, speed, self.journal, asking)
+        self.kept_out.clear()
         come, present = [], here.present.copy()
         for i in due:
             if self.held.room[i] <= 0.0:
@@ -207,6 +218,8 @@ class Simulation:
                 self.own[self.p.consists.first[i] : self.p.consists.first[i + 1], SPEED] = v
                 speed[i] = v
                 come.append((i, v))
+            else:
+                self.kept_out[i] = waiting.kept_out(view, i)
         return come
 
     def _topology(self, t: float, seen: Seen, view: View | None) -> None:
@@ -345,32 +358,37 @@ class Simulation:
         stands = ~raw.present
         ordered = free
         if self.service is not None:
-            ordered = self.service.drive(raw, speed, view, self.stops)
+            ordered = self.service.drive(raw, speed, self.motion.acceleration(own), view, self.stops)
             if self.p.rails.slope.any():
                 places = own[:, POSITION] - np.repeat(self.service.offset, np.diff(self.p.consists.first))
                 self.motion.climbs(under(self.world.ways, self.p.rails.slope, raw.row, self.p.consists.first, places))
             stands = stands | self.service.standing | self.service.halted
         if self.supervision.rules.mode == "off":
             return self._advance(t, own, ordered, disturbed, stands)
-        verdict = self.supervision.verdict(view, speed)
+        verdict = self.supervision.verdict(view, speed, self.motion.acceleration(own), disturbed.measurement)
         trial = self.motion.saved(), self.exchange.copy()
-        moved, motion = self._advance(t, own, ordered, disturbed, stands)
-        within, acts = applied(verdict, motion.acceleration)
+        # It judges the step as it would be without what disturbs it, which nobody knows before.
+        moved, motion = self._advance(t, own, ordered, disturbed.calm(), stands, calm=True)
+        within, acts = applied(verdict, motion.asked)
         acts &= ~stands
-        if self.supervision.rules.mode == "on" and acts.any():
+        acts_on = self.supervision.rules.mode == "on" and acts.any()
+        if acts_on or self.disturbing:
             self.motion.restore(trial[0])
             self.exchange = trial[1]
-            ordered = np.where(acts, within, ordered)
+            ordered = np.where(acts, within, ordered) if acts_on else ordered
             moved, motion = self._advance(t, own, ordered, disturbed, stands)
         self.supervision.tell(self.journal, t, verdict, acts, view, speed)
         return moved, motion
 
     def _advance(
-        self, t: float, own: Floats, ordered: Floats, disturbed: disturbance.Disturbed, stands: Bools | None = None
-    ) -> tuple[Floats, Motion]:
+        self, t: float, own: Floats, ordered: Floats, disturbed: disturbance.Disturbed, stands: Bools | None = None,
+        calm: bool = False,
+    ) -> tuple[Floats, Motion]:  # fmt: skip
         """The plant over one step; trains that stand, or are not there, stay as they are."""
         pace = None if self.service is None else self.service.leader()
-        moved, motion = self.motion.advance(self.k, t, own, self.demand, self.links, self.exchange, disturbed, ordered, pace)
+        moved, motion = self.motion.advance(
+            self.k, t, own, self.demand, self.links, self.exchange, disturbed, ordered, pace, calm
+        )  # fmt: skip
         if stands is None:
             return moved, motion
         moved[np.abs(moved[:, SPEED]) < STANDS, SPEED] = 0.0  # a stand ordered is one, rounding aside
@@ -380,7 +398,7 @@ class Simulation:
         moved[np.repeat(stands & here, np.diff(self.p.consists.first)), SPEED] = 0.0
         return moved, motion._replace(
             displacement=np.where(stands, 0.0, motion.displacement), clipped=motion.clipped & ~stands,
-            acceleration=np.where(stands, 0.0, motion.acceleration),
+            acceleration=np.where(stands, 0.0, motion.acceleration), asked=np.where(stands, 0.0, motion.asked),
         )  # fmt: skip
 
     def _check(self, t: float, motion: Motion) -> None:
@@ -413,7 +431,7 @@ class Simulation:
             motion=motion, saturated=self._saturated(motion), extremes=past, disturbed=disturbed,
             led=None if self.service is None else self.service.led,
         )  # fmt: skip
-        for alarm in self.alarms.new(row):
+        for alarm in self.alarms.new(row, self.world.ways, self.world.measure()):
             self.journal.event(t, "violation", **alarm)
         if self._recorded:
             self.journal.write(row)

@@ -14,6 +14,9 @@ from trainctl.prepare import Prepared
 from trainctl.signals import FORCE, GRAVITY, POSITION, POWERS, SPEED, Bools, Demand, Floats, Links, Scene
 from trainctl.topology.exchange import Exchange
 
+#: A law may move a train within a step by so much [m] per second more or less than a held acceleration would.
+WITHIN_M = 0.02
+
 
 class Motion(NamedTuple):
     """One simulator step of all trains."""
@@ -21,6 +24,7 @@ class Motion(NamedTuple):
     displacement: Floats  # (n,) m, what SUMO is told to do
     input: Floats  # (n,) m/s2, force of the whole train per mass at the beginning of the step
     acceleration: Floats  # (n,) m/s2, mean over the step
+    asked: Floats  # (n,) m/s2, what drives the train, as the supervisor judges it
     limited: Bools  # (n,) a limit of the plant acted
     clipped: Bools  # (n,) the train would have moved backwards
     force: Floats | None  # (U,) N at the beginning of the step
@@ -49,7 +53,7 @@ class Points:
 
     def advance(
         self, k: int, t: float, own: Floats, demand: Demand, links: Links | None, exchange: Exchange, disturbed: Disturbed,
-        ordered: Floats, pace: Floats | None,
+        ordered: Floats, pace: Floats | None, calm: bool = False,
     ) -> tuple[Floats, Motion]:  # fmt: skip
         """One exact step of the discrete map; ``ordered`` (n,) accelerations stand for the law's where they are not NaN."""
         constants = self.constants._replace(resistance_factor=disturbed.resistance)
@@ -57,7 +61,11 @@ class Points:
         asked = np.where(np.isnan(ordered), demand.acceleration, ordered)
         moved = point.advance(constants, own, asked, self.step, kick)
         mean = (moved.own[:, SPEED] - own[:, SPEED]) / self.step
-        return moved.own, Motion(moved.displacement, moved.input, mean, moved.limited, moved.clipped, None, {})
+        return moved.own, Motion(moved.displacement, moved.input, mean, mean, moved.limited, moved.clipped, None, {})
+
+    def acceleration(self, own: Floats) -> Floats:
+        """Nothing acts late here, so it does not matter."""
+        return np.zeros(len(own))
 
     def overrun(self, own: Floats, braking: float) -> Floats:
         """Nothing acts late here."""
@@ -102,6 +110,7 @@ class Units:
             np.concatenate([p.reference.breaks[np.isfinite(p.reference.breaks)], faults.breaks(p.scenario.fault)])
         )
         self.masses = p.consists.train_mass()
+        self.lag = p.assumed.lag
         self.extremes = self._fresh()
         self.counted = -1  # number of the last exchange
         guided = p.roster is not None
@@ -146,9 +155,9 @@ class Units:
 
     def advance(
         self, k: int, t: float, own: Floats, demand: Demand, links: Links | None, exchange: Exchange, disturbed: Disturbed,
-        ordered: Floats, pace: Floats | None,
+        ordered: Floats, pace: Floats | None, calm: bool = False,
     ) -> tuple[Floats, Motion]:  # fmt: skip
-        """Integrate over one simulator step; the displacement is that of the heads.
+        """Integrate over one simulator step; the displacement is that of the heads. ``calm``: without the plant's noise.
 
         Trains with an ``ordered`` (n,) acceleration, not NaN, hold that instead of what their law demands. ``pace`` (4, n) is where
         each train's own reference is now, where they have one.
@@ -171,7 +180,7 @@ class Units:
         demanded = None
         for begin, sub_steps in self._pieces(t):
             self._exchange(begin, moved, links, exchange)
-            self._make_noise(begin)
+            self._make_noise(begin, calm)
             applied = integrate.advance(
                 self.parts, self.loop, first, p.consists.length, links, p.reference, self.air, begin, self.h, sub_steps,
                 self.breaks, moved, self.estimate, self.work, self.extremes,
@@ -180,14 +189,15 @@ class Units:
         assert demanded is not None
         extras = self._extras(t, own, estimate, demanded)
         force = own[:, FORCE].copy() if p.plant.STATES > FORCE else demanded
-        displacement = moved[heads, POSITION] - own[heads, POSITION] + disturbed.position
+        displacement = moved[heads, POSITION] - own[heads, POSITION] + np.where(own[heads, SPEED] > 0.0, disturbed.position, 0.0)
         clipped = displacement < 0.0
         displacement[clipped] = 0.0
         shift = np.repeat(own[heads, POSITION] + displacement - moved[heads, POSITION], np.diff(first))
         moved[:, POSITION] += shift
+        mean = (moved[heads, SPEED] - own[heads, SPEED]) / self.step
         return moved, Motion(
-            displacement=displacement, input=np.add.reduceat(force, heads) / self.masses,
-            acceleration=(moved[heads, SPEED] - own[heads, SPEED]) / self.step,
+            displacement=displacement, input=np.add.reduceat(force, heads) / self.masses, acceleration=mean,
+            asked=self._asked(own, moved, displacement, mean),
             limited=self.extremes.limited > limited, clipped=clipped, force=force, extras=extras,
         )  # fmt: skip
 
@@ -196,6 +206,31 @@ class Units:
         force: Floats = point.climbing(own[:, POSITION], self.gradient) + GRAVITY * self.plant.units[:, coupled_units.SLOPE]
         return force
 
+    def _asked(self, own: Floats, moved: Floats, displacement: Floats, mean: Floats) -> Floats:
+        """Acceleration that drives every train over the step [m/s2], (n,).
+
+        Where actuators lag it is what they approach; else the mean, or the one that explains the displacement where a law pulls
+        first and brakes later within the step.
+        """
+        heads = self.p.heads
+        v, after = own[heads, SPEED], moved[heads, SPEED]
+        if self.p.plant.STATES > FORCE:
+            gained = self.lag * (self.acceleration(moved) - self.acceleration(own)) / self.step
+            return np.where(after > 0.0, mean + gained, mean)
+        beyond = displacement - 0.5 * (v + after) * self.step
+        explained = mean + 2.0 * beyond / self.step**2
+        swings = (np.abs(beyond) > WITHIN_M * self.step) & (after > 0.0)
+        return np.where(swings, explained, mean)
+
+    def acceleration(self, own: Floats) -> Floats:
+        """Acceleration of every train now, where actuators make it a state [m/s2], (n,)."""
+        if self.p.plant.STATES <= FORCE:
+            return np.zeros(len(self.masses))
+        c, heads = self.p.consists, self.p.heads
+        force = np.add.reduceat(own[:, FORCE], heads) - self.masses * self.believed_resistance(own)
+        found: Floats = force / np.add.reduceat(c.mass * c.rotating, heads)
+        return np.where(own[heads, SPEED] > 0.0, found, np.maximum(found, 0.0))
+
     def overrun(self, own: Floats, braking: float) -> Floats:
         """How much farther every train comes to a stand than by ``braking`` [m/s2] from now on, as actuators act late [m], (n,).
 
@@ -203,11 +238,8 @@ class Units:
         """
         if self.p.plant.STATES <= FORCE:
             return np.zeros(len(self.masses))
-        c, heads = self.p.consists, self.p.heads
-        force = np.add.reduceat(own[:, FORCE], heads) - self.masses * self.believed_resistance(own)
-        acceleration = force / np.add.reduceat(c.mass * c.rotating, heads)
-        lag = np.maximum.reduceat(1.0 / c.actuator_rate, heads)
-        found: Floats = lag * np.maximum(own[heads, SPEED], 0.0) * np.maximum(acceleration / braking + 1.0, 0.0)
+        late = np.maximum(self.acceleration(own) / braking + 1.0, 0.0)
+        found: Floats = self.lag * np.maximum(own[self.p.heads, SPEED], 0.0) * late
         return found
 
     def climbs(self, slope: Floats) -> None:
@@ -271,9 +303,12 @@ class Units:
         exchange.heard[fresh] = self.work.sent[links.sender[fresh]]
         self.air = self.air._replace(heard=exchange.heard.copy(), sent_at=t)
 
-    def _make_noise(self, t: float) -> None:
-        """Overwrite the plant's noise if a new sample begins at ``t``."""
+    def _make_noise(self, t: float, calm: bool) -> None:
+        """Overwrite the plant's noise with the sample at ``t``, or with none."""
         if self.noise_hold is None:
+            return
+        if calm:
+            self.plant.units[:, actuated_units.NOISE] = 0.0
             return
         sample = math.floor(t / self.noise_hold + 1e-6)
         noise = actuated_units.noise(self.p.plant_params, self.p.scenario.run.seed or 0, sample, len(self.estimate))

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 import sumo_net
 from sumo_net import Line, LineError, Rails
-from trainctl import prepare_line, roster, supervisor
+from trainctl import prepare_line, promise, roster, supervisor
 from trainctl.errors import InputError
 from trainctl.laws import find_law, find_observer
 from trainctl.plants import actuated_units, disturbance, point, shared
@@ -88,12 +88,18 @@ class Prepared:
 
     @cached_property
     def sure_braking(self) -> Floats:
-        """Deceleration every train can give at any speed it may have [m/s2], shape (n,); infinite for points without a clamp."""
+        """Deceleration every train can give on the level at any speed it may have [m/s2], shape (n,); infinite for free points."""
         if self.scenario.plant.kind == "point":
             clamp = self.plant_params.input_lower_mps2
             return np.full(len(self.scenario.train), np.inf if clamp is None else -clamp)
-        least, _ = shared.room(self.consists, np.zeros_like(self.fastest), self.fastest)
+        top = promise.top_speed(self)
+        least, _ = shared.room(self.consists, np.zeros_like(top), top)
         return -least
+
+    @cached_property
+    def assumed(self) -> supervisor.Assumed:
+        """What the supervisor relies on of every train."""
+        return promise.assume(self)
 
     @property
     def heads(self) -> Ints:
@@ -259,7 +265,8 @@ def prepare(
         elif law.CLOCK != "none":  # such trains leave at the line's end
             found += prepare_line.long_enough(prepared)
         found += prepare_line.steep(prepared)
-        found += _can_brake(prepared)
+        weak = _can_brake(prepared)
+        found += weak or promise.refusals(prepared)
     if found:
         # What follows from a key that is wrong already is not a mistake of its own.
         wrong = [line.partition(" = ")[0].partition(":")[0].rpartition(".")[2] for line in known]

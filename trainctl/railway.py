@@ -44,14 +44,17 @@ class Lookout:
         self.theta = p.step_theta
         rules = p.supervision
         planned = [rules.service_mps2] + ([p.driving.deceleration_mps2] if p.roster else [])
-        self.rate = min(rules.emergency_mps2, *planned)
+        self.assumed = p.assumed
+        self.rate = np.minimum(self.assumed.braking, min(rules.emergency_mps2, *planned))
         self.ways: Ways | None = None
 
     def _reach(self, speed: Floats) -> Floats:
         """How far ahead every train claims [m]: farther than it would brake for what it must not enter."""
-        v, step = np.maximum(speed, 0.0), self.p.scenario.run.step_s
+        assumed, step = self.assumed, self.p.scenario.run.step_s
+        v = np.maximum(speed, 0.0) + assumed.drift + 2.0 * assumed.lag * self.p.supervision.emergency_mps2
         braking = supervisor.stopping_distance(v, self.rate, step, self.theta)
-        return braking + 4.0 * v * step + self.p.supervision.margin_m + 2.0 * DRIVER_MARGIN_M + 50.0
+        clear = self.p.supervision.margin_m + 2.0 * DRIVER_MARGIN_M + 50.0 + 6.0 * assumed.uncertainty
+        return braking + 4.0 * v * step + clear
 
     def claim(self, t: float, ways: Ways, seen: Seen, speed: Floats, journal: Journal, entering: Bools) -> claims.Held:
         """Let every train claim what lies within its reach; ``entering`` (n,) are those that ask to enter the net."""
@@ -102,10 +105,12 @@ class Supervision:
         self.acting: Bools = np.zeros(len(p.scenario.ids), bool)
         self.theta = p.step_theta
 
-    def verdict(self, view: View, speed: Floats) -> supervisor.Verdict:
-        """What every train may do over the coming step."""
+    def verdict(self, view: View, speed: Floats, acceleration: Floats, error: Floats) -> supervisor.Verdict:
+        """What every train may do over the coming step; ``error`` (n,) is that of the measured positions [m]."""
+        targets, limits = lookout.measured(view.targets, view.limits, error)
+        clear = targets if view.clear is view.targets else lookout.measured(view.clear, view.limits, error)[0]
         return lookout.judge(
-            self.rules, np.maximum(speed, 0.0), view.targets, view.clear, view.limits, self.p.scenario.run.step_s, self.theta
+            self.rules, speed, targets, clear, limits, self.p.scenario.run.step_s, self.theta, self.p.assumed, acceleration
         )
 
     def tell(self, journal: Journal, t: float, verdict: supervisor.Verdict, acts: Bools, view: View, speed: Floats) -> None:

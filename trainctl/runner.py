@@ -20,7 +20,7 @@ import tomli_w
 import sumo_net
 from sumo_net import LineError
 from sumo_net.netfile import unpack
-from trainctl import checkpoint, roster
+from trainctl import checkpoint, promise, roster
 from trainctl.errors import InputError, SimulatorError
 from trainctl.loop import Simulation
 from trainctl.prepare import Prepared, prepare
@@ -125,7 +125,8 @@ def opened(
     partial = claim(out, force)
     with held(partial):
         text = p.scenario.toml()
-        info = about_run(text, p.scenario.run.seed or 0, command_line or sys.argv, backend=backend)
+        protection = {"protection": promise.told(p)} if p.supervision.mode != "off" else {}
+        info = about_run(text, p.scenario.run.seed or 0, command_line or sys.argv, backend=backend, **protection)
         write_info(partial, info)
         (partial / "scenario.toml").write_text(text, encoding="utf-8")
         keep_law(p, partial)
@@ -224,7 +225,9 @@ def _driven(
             world.close()
             for at, message in world.messages():
                 journal.event(simulation.time if at is None else at, "sumo_warning", message=message)
-            end = {"steps": simulation.k, "violations": simulation.alarms.total, "first_violation": simulation.alarms.first}
+            for at, alarm in simulation.alarms.counted(simulation.time, world.collisions()):
+                journal.event(at, "violation", **alarm)
+            end = {"steps": simulation.k, **simulation.alarms.outcome(simulation.not_entered)}
             done = {"end": end, "wall_time_s": elapsed(), "recorder": journal.recorder.cut()}
             checkpoint.replace(place / checkpoint.DONE, json.dumps(plain(done)).encode())
             journal.close()

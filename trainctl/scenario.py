@@ -112,6 +112,9 @@ class Traffic(Table):
     join_range_m: Positive = Field(20000.0, description="A train farther behind does not try to catch up [m].")
     join_band_m: Positive = Field(50.0, description="A train joins once its spacing is right within this, and in its bounds [m].")
     join_band_mps: Positive = Field(0.5, description="... and its speed that of the formation within this [m/s].")
+    wait_limit_s: Positive = Field(
+        600.0, description="Waiting for another train, a switch or its entry, but not at its own stop, is told beyond this [s]."
+    )
 
 
 class BoundsTable(Table):

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trainctl import lookout, supervisor
+from trainctl import lookout, promise, supervisor
 from trainctl.lookout import View
 from trainctl.prepare import Prepared
 from trainctl.railway import DRIVER_MARGIN_M
@@ -101,6 +101,7 @@ class Service:
         self.least, self.greatest = _band(p, self.spacing) if self.roster.cooperates.sum() > 1 else (-np.inf, np.inf)
         # The driver brakes as planned and keeps farther away, so that the supervisor has nothing to do.
         rate = min(self.driving.deceleration_mps2, rules.emergency_mps2)
+        self.assumed = promise.planned(p.assumed, rate)
         self.rules = rules.model_copy(update={
             "mode": "on", "emergency_mps2": rate, "service_mps2": rate, "greatest_mps2": self.driving.acceleration_mps2,
             "margin_m": rules.margin_m + DRIVER_MARGIN_M, "emergency_distance_m": 0.0,
@@ -135,6 +136,11 @@ class Service:
             first.setdefault(int(self.roster.edge[i]), i)
         return sorted(first.values(), key=lambda i: (self.roster.depart[i], i))
 
+    def missing(self, t: float) -> list[str]:
+        """Trains whose time had come by ``t`` [s] and that never entered."""
+        late = np.flatnonzero(~self.came & (self.roster.depart <= t + 1e-9))
+        return [self.p.scenario.ids[i] for i in late.tolist()]
+
     def entering_speed(self, i: int, speed: Floats, view: View) -> float | None:
         """Speed with which a train can enter safely; None if it has to wait. ``view`` is that with the train at its place."""
         rules, v = self.rules, self.roster.speed[i]
@@ -142,18 +148,15 @@ class Service:
         on_edge = limit - self.driving.below_limit_mps
         wanted = float(min(self.cruise[i], max(on_edge, 0.0)) if np.isnan(v) else min(v, limit))
         if (stop := self.stop_of(i)) is not None:  # it must be able to stop there
-            ahead = stop.place - float(self.p.rails.start_m[self.roster.edge[i]]) - float(self.roster.lane_position[i])
-            room = np.array([ahead - wanted * self.step])
-            wanted = min(wanted, float(supervisor.greatest_speed(room, rules.service_mps2, self.step, self.theta)[0]))
-        here = view.targets.train == i
-        room = view.targets.room[here] - rules.margin_m
-        follows = view.targets.moving[here] & (view.targets.kind[here] == supervisor.TRAIN) & (rules.curve == "relative")
-        braking = supervisor.stopping_distance(view.targets.speed[here], rules.emergency_mps2, self.step, self.theta)
-        room = room + np.where(follows, braking, 0.0)
-        room = np.where(view.targets.kind[here] == supervisor.OPPOSING, 0.5 * room, room)
-        safe = supervisor.greatest_speed(room, rules.emergency_mps2, self.step, self.theta)
+            place = stop.place - float(self.p.rails.start_m[self.roster.edge[i]]) - float(self.roster.lane_position[i])
+            room = np.array([place - wanted * self.step])
+            planned = float(min(rules.service_mps2, self.assumed.braking[i]))
+            wanted = min(wanted, float(supervisor.greatest_speed(room, planned, self.step, self.theta)[0]))
+        ahead = lookout.of(view.targets, view.targets.train == i)
+        stands = np.where(np.arange(self.n) == i, 0.0, speed)
+        _, safe = supervisor.too_late(rules, self.assumed, stands, ahead, self.step, self.theta)
         entry = float(min(wanted, *safe.tolist(), np.inf))
-        if np.any(view.targets.room[here] < rules.margin_m) or entry < (wanted - 1e-9 if not np.isnan(v) else ENTERS_WITH * wanted):
+        if np.any(ahead.room < rules.margin_m) or entry < (wanted - 1e-9 if not np.isnan(v) else ENTERS_WITH * wanted):
             return None
         other = int(view.ahead.train[i])
         if other >= 0 and self.roster.cooperates[[i, other]].all() and view.ahead.spacing[i] < self.spacing.desired - 1.0:
@@ -163,7 +166,9 @@ class Service:
         behind = view.targets.other == i
         if behind.any():
             asked = lookout.of(view.targets, behind)
-            seen = supervisor.verdict(rules, trial, asked, supervisor.no_limits(), self.step, self.theta)
+            seen = supervisor.verdict(
+                rules, trial, asked, supervisor.no_limits(), self.step, self.theta, self.assumed, np.zeros(self.n)
+            )
             if np.any(seen.emergency[view.targets.train[behind]]):
                 return None
         return entry
@@ -218,7 +223,8 @@ class Service:
             trains.append(i)
             rooms.append(max(room - float(overrun[i]), 0.0))
         found, room_to = np.array(trains, np.int64), np.array(rooms)
-        braking = supervisor.stopping_distance(np.maximum(speed[found], 0.0), self.rules.service_mps2, self.step, self.theta)
+        rate = np.minimum(self.rules.service_mps2, self.assumed.braking[found])
+        braking = supervisor.stopping_distance(speed[found], rate, self.step, self.theta)
         near, soon = np.zeros(self.n, bool), np.zeros(self.n, bool)
         near[found] = room_to < braking + 10.0 * self.step * speed[found] + 50.0
         soon[found] = room_to < braking + SOON_S * speed[found]
@@ -338,16 +344,17 @@ class Service:
 
     # Driving
 
-    def drive(self, seen: Seen, speed: Floats, view: View, stops: tuple[Ints, Floats]) -> Floats:
+    def drive(self, seen: Seen, speed: Floats, acceleration: Floats, view: View, stops: tuple[Ints, Floats]) -> Floats:
         """Set the pace of formations and return the accelerations of trains that are driven [m/s2], NaN where the law drives."""
         led, front = self.led, convoys.fronts(self.ahead)
         first = front == np.arange(self.n)
         v = np.maximum(np.where(led, self.pace.speed, speed), 0.0)
         limits = view.limits._replace(speed=self._below(view.limits.speed))
-        by_limits = supervisor.verdict(self.rules, v, supervisor.no_targets(), limits, self.step, self.theta).greatest
+        relied = self.assumed, acceleration
+        by_limits = supervisor.verdict(self.rules, v, supervisor.no_targets(), limits, self.step, self.theta, *relied).greatest
         targets = lookout.with_targets(lookout.of(view.targets, first[view.targets.train]), *stops, STOP)
         clear = lookout.with_targets(lookout.of(view.clear, first[view.clear.train]), *stops, STOP)
-        free = lookout.judge(self.rules, v, targets, clear, supervisor.no_limits(), self.step, self.theta).greatest
+        free = lookout.judge(self.rules, v, targets, clear, supervisor.no_limits(), self.step, self.theta, *relied).greatest
         lowest = np.full(self.n, np.inf)
         np.minimum.at(lowest, front, np.minimum(by_limits, np.where(first, free, np.inf)))
         wish = (self._wish(seen, v, view) - v) / self.step

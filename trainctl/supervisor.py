@@ -27,16 +27,27 @@ no margin touched: before a fixed point ``d >= D(v)``, behind a moving train ``d
    v' < w' even when the train ahead brakes fully, then v < w too, because no train brakes harder than b: the lower speed before
    and after, so the gap grew. Hence no gap falls below the margin, and one that began below it does not shrink.
 
+3. What a train does is not what is ordered. ``Assumed`` says by how much, train by train: it brakes with ``braking`` at least
+   and ``hardest`` at most, it gains ``scatter`` more speed than ordered, it advances by ``drift`` faster than its speed says. So D
+   is taken at ``v + drift`` with the sure braking, D of the train ahead with the hardest, and ``scatter`` is taken off the
+   greatest acceleration. A train that brakes more weakly than the one ahead comes nearest at the end or now (while the closing
+   speed is positive it grows), so 2. holds with ``braking <= hardest``.
+4. An actuator of lag r follows what is ordered late: ``a' = (u - a) / r``. Under full braking the speed ``v + r (a + braking)``
+   falls just as that of a train without lag, and is never below v, so it takes the place of v before points; before speed limits
+   ``v + r a`` does, the speed reached once no more is ordered.
+
 Holding the speed v behind a train of the same speed therefore needs v T beyond the margin: the train ahead may begin to brake
 now, its follower learns of it one step later.
 """
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
+from pydantic.json_schema import SkipJsonSchema
+from pydantic_core import PydanticCustomError
 
 from trainctl.signals import Bools, Floats, Ints, Table
 
@@ -51,6 +62,10 @@ _FAR = 1e9
 _LENGTH, _RATE = 1e-6, 1e-9
 
 
+def _no_unit(value: object) -> None:
+    raise PydanticCustomError("unit_missing", "the key must carry the unit: position_uncertainty_m or speed_uncertainty_mps")
+
+
 class Params(Table):
     """Keys of the scenario's [supervisor] table."""
 
@@ -61,7 +76,10 @@ class Params(Table):
         "relative", description="A train ahead is taken to need its braking distance itself, or to stand where its rear is now."
     )
     emergency_mps2: float = Field(
-        1.0, gt=0.0, description="Deceleration [m/s2] every train can give at any speed, and none is let exceed."
+        1.0,
+        gt=0.0,
+        description="Full braking [m/s2]: every train can give it on the level at any speed, and none is let exceed it. What is"
+        " relied on is less by slopes, faults and disturbances: see `trainctl check`.",
     )
     service_mps2: float = Field(
         0.7, gt=0.0, description="Deceleration [m/s2] planned with before lower speed limits and stops; at most emergency_mps2."
@@ -71,12 +89,33 @@ class Params(Table):
     emergency_distance_m: float = Field(
         0.0, ge=0.0, description="Gap to another train [m] below which emergency braking is ordered whatever the speeds."
     )
+    position_uncertainty_m: float | None = Field(
+        None, ge=0.0, description="Maximum error of a measured position [m], beside that of [[disturbance]]; widens the margin."
+    )
+    speed_uncertainty_mps: float | None = Field(
+        None,
+        ge=0.0,
+        description="Maximum error of a measured speed [m/s]: a train may be faster, the one ahead slower than measured.",
+    )
+    uncertainty: SkipJsonSchema[Annotated[None, BeforeValidator(_no_unit)]] = None
 
     @model_validator(mode="after")
     def _rates(self) -> Params:
         if self.service_mps2 > self.emergency_mps2:
             raise ValueError(f"service_mps2 = {self.service_mps2:g}: at most emergency_mps2 = {self.emergency_mps2:g}")
         return self
+
+
+class Assumed(NamedTuple):
+    """What is relied on of every train, shape (n,): see note 3 of the module. Made from a scenario in ``trainctl.promise``."""
+
+    braking: Floats  # m/s2, > 0: what it gives for sure when full braking is ordered
+    hardest: Floats  # m/s2, >= braking: it slows down no faster
+    scatter: Floats  # m/s2, >= 0: its acceleration may exceed the ordered one by this
+    drift: Floats  # m/s, >= 0: it may advance faster than its measured speed by this
+    lag: Floats  # s, of its slowest actuator, 0: none
+    uncertainty: Floats  # m, >= 0, of its measured position
+    blur: float  # m/s, of every measured speed
 
 
 class Targets(NamedTuple):
@@ -112,6 +151,12 @@ class Verdict(NamedTuple):
     strongest: float  # m/s2, -emergency_mps2
 
 
+def as_ordered(rate: float, trains: int) -> Assumed:
+    """Assume that all trains do just what is ordered, and brake with ``rate`` [m/s2]."""
+    full, none = np.full(trains, rate), np.zeros(trains)
+    return Assumed(full, full, none, none, none, none, 0.0)
+
+
 def no_targets() -> Targets:
     """Nothing in the way of anybody."""
     none = np.zeros(0, np.int64)
@@ -123,7 +168,7 @@ def no_limits() -> Limits:
     return Limits(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
 
 
-def stopping_distance(speed: Floats, b: float, step: float, theta: float) -> Floats:
+def stopping_distance(speed: Floats, b: float | Floats, step: float, theta: float) -> Floats:
     """Way [m] from ``speed`` [m/s] to a stand, braking with ``b`` [m/s2] in steps of ``step`` [s]: D of the module.
 
     With ``v = (m + f) b T``, m whole, 0 <= f < 1: ``D = b T^2 ((m + 1)(m/2 + f) - theta (m + f))``. At least ``v^2 / 2b`` for
@@ -136,7 +181,7 @@ def stopping_distance(speed: Floats, b: float, step: float, theta: float) -> Flo
     return way
 
 
-def greatest_speed(room: Floats, b: float, step: float, theta: float) -> Floats:
+def greatest_speed(room: Floats, b: float | Floats, step: float, theta: float) -> Floats:
     """Greatest speed [m/s] with ``stopping_distance`` within ``room`` [m]; 0 where there is no room. Shape of ``room``."""
     s = np.maximum(room, 0.0) / (b * step**2)
     m = np.maximum(np.floor(theta - 0.5 + np.sqrt((theta - 0.5) ** 2 + 2.0 * s)), 0.0)
@@ -151,7 +196,7 @@ def curve(room: Floats, target_speed: Floats, b: float) -> Floats:
     return speed
 
 
-def speed_after(room: Floats, target_speed: Floats, speed: Floats, b: float, step: float, theta: float) -> Floats:
+def speed_after(room: Floats, target_speed: Floats, speed: Floats, b: float | Floats, step: float, theta: float) -> Floats:
     """Greatest v' [m/s] after a step from which braking still ends at ``target_speed`` u, in whole steps, within ``room`` [m].
 
     Reaching u from ``v' = u + e`` in N steps takes ``T (S - theta e) + N u T`` with S the sum of the excesses e, e - b T, ...
@@ -167,11 +212,14 @@ def speed_after(room: Floats, target_speed: Floats, speed: Floats, b: float, ste
     return after
 
 
-def verdict(params: Params, speed: Floats, targets: Targets, limits: Limits, step_s: float, theta: float) -> Verdict:
+def verdict(
+    params: Params, speed: Floats, targets: Targets, limits: Limits, step_s: float, theta: float,
+    assumed: Assumed | None = None, acceleration: Floats | None = None,
+) -> Verdict:  # fmt: skip
     """Judge what every train may do over the coming step; the rule and its proof are in the notes of the module.
 
-    Points are kept clear of by braking with ``emergency_mps2``. Lower limits and stops are braked for with ``service_mps2``;
-    where that does not suffice any more, with up to ``emergency_mps2`` from the last moment on.
+    Points are kept clear of by braking as hard as the train surely can. Lower limits and stops are braked for with
+    ``service_mps2``; where that does not suffice any more, with up to full braking from the last moment on.
 
     Parameters
     ----------
@@ -180,25 +228,32 @@ def verdict(params: Params, speed: Floats, targets: Targets, limits: Limits, ste
     speed : ndarray, shape (n,)
         Of every train [m/s], >= 0.
     targets, limits : Targets, Limits
-        For the positions and speeds of now. A train ahead must be bound by the same ``params``, and the two of an opposing pair
-        have a row each.
+        For the positions and speeds of now, as measured. A train ahead must be bound by the same ``params``, and the two of an
+        opposing pair have a row each.
     step_s, theta : float
         T [s] and theta of the motion, 0 <= theta < 1.
+    assumed : Assumed, optional
+        What is relied on; trains that do as ordered if left out.
+    acceleration : ndarray, shape (n,), optional
+        Of every train now [m/s2]; needed where there is lag.
 
     Returns
     -------
     Verdict
         Where no acceleration is safe any more (not from a safe state): emergency braking.
     """
-    b = params.emergency_mps2
-    least = np.maximum(-b, -speed / step_s)
-    rates = np.concatenate(
-        [_before_targets(params, speed, targets, step_s, theta), _before_limits(params, speed, limits, step_s, theta)]
-    )
+    b, n = params.emergency_mps2, len(speed)
+    relied = as_ordered(b, n) if assumed is None else assumed
+    now = np.zeros(n) if acceleration is None else acceleration
+    least = np.where(relied.lag > 0.0, -b, np.maximum(-b, -(speed + relied.drift) / step_s - relied.scatter))
+    rates = np.concatenate([
+        _before_targets(params, relied, speed, now, targets, step_s, theta),
+        _before_limits(params, relied, speed, now, limits, step_s, theta),
+    ])  # fmt: skip
     train = np.concatenate([targets.train, limits.train])
-    bound = np.full(len(speed), params.greatest_mps2)
+    bound = np.full(n, params.greatest_mps2)
     np.minimum.at(bound, train, rates)
-    reason, target = np.full(len(speed), -1, np.int64), np.full(len(speed), -1, np.int64)
+    reason, target = np.full(n, -1, np.int64), np.full(n, -1, np.int64)
     binds = np.flatnonzero((rates == bound[train]) & (rates < params.greatest_mps2))[::-1]  # of equals the first row stands
     target[train[binds]] = np.where(binds < len(targets.train), binds, binds - len(targets.train))
     reason[train[binds]] = np.concatenate([targets.kind, np.full(len(limits.train), LIMIT)])[binds]
@@ -206,44 +261,91 @@ def verdict(params: Params, speed: Floats, targets: Targets, limits: Limits, ste
     return Verdict(np.maximum(bound, least), least, emergency, reason, target, -b)
 
 
-def _before_targets(params: Params, speed: Floats, targets: Targets, step: float, theta: float) -> Floats:
-    """Greatest acceleration each target leaves its train [m/s2], shape (k,); -inf: even full braking comes too late."""
-    b = params.emergency_mps2
-    v = speed[targets.train]
-    own = stopping_distance(v, b, step, theta)
-    other = stopping_distance(targets.speed, b, step, theta)
+class _Braking(NamedTuple):
+    """Braking for every target, shape (k,)."""
+
+    room: Floats  # m, to the point less the margin
+    to_stop: Floats  # m, that may pass until the train stands
+    speed: Floats  # m/s, from which it brakes: what the train may be as fast as
+    way: Floats  # m, it takes with full braking from now on
+
+
+def _braking(params: Params, relied: Assumed, speed: Floats, now: Floats, targets: Targets, step: float, theta: float) -> _Braking:
+    i, j = targets.train, targets.other
     a_train, opposing, stop = targets.kind == TRAIN, targets.kind == OPPOSING, targets.kind == STOP
-    room = np.minimum(targets.room, _FAR) - np.where(stop, 0.0, params.margin_m)
+    more = relied.drift + relied.lag * np.maximum(now + relied.braking, 0.0)
+    v, b = speed[i] + np.where(stop, relied.drift[i], more[i]), relied.braking[i]  # the room to a stop counts the lag already
+    own = stopping_distance(v, b, step, theta)
+    known = j >= 0
+    margin = params.margin_m + relied.uncertainty[i] + np.where(known, relied.uncertainty[j], 0.0)
+    room = np.minimum(targets.room, _FAR) - np.where(stop, 0.0, margin)
     follows = a_train & targets.moving & (params.curve == "relative")
-    to_stop = np.where(follows, room + other, np.where(opposing & targets.moving, 0.5 * (room + own - other), room))
-    after = speed_after(to_stop, np.zeros(len(v)), v, b, step, theta)
-    late = to_stop < own - _LENGTH
-    late |= (a_train | opposing) & (targets.room < params.emergency_distance_m)
+    away = stopping_distance(np.maximum(targets.speed - relied.blur, 0.0), relied.hardest[j], step, theta)
+    comes = stopping_distance(targets.speed + np.where(known, more[j], 0.0), relied.braking[j], step, theta)
+    to_stop = np.where(follows, room + away, np.where(opposing & targets.moving, 0.5 * (room + own - comes), room))
+    return _Braking(room, to_stop, v, own)
+
+
+def too_late(
+    params: Params, assumed: Assumed, speed: Floats, targets: Targets, step_s: float, theta: float
+) -> tuple[Bools, Floats]:
+    """Say before which targets even full braking comes too late, and from which speed [m/s] it would not, shape (k,) each.
+
+    Arguments are those of ``verdict``, for trains that hold their speeds.
+    """
+    found = _braking(params, assumed, speed, np.zeros(len(speed)), targets, step_s, theta)
+    b = assumed.braking[targets.train]
+    enough = greatest_speed(found.to_stop, b, step_s, theta) - (found.speed - speed[targets.train])
+    return found.to_stop < found.way - _LENGTH, np.maximum(enough, 0.0)
+
+
+def _before_targets(
+    params: Params, relied: Assumed, speed: Floats, now: Floats, targets: Targets, step: float, theta: float
+) -> Floats:
+    """Greatest acceleration each target leaves its train [m/s2], shape (k,); -inf: even full braking comes too late."""
+    i, stop = targets.train, targets.kind == STOP
+    found = _braking(params, relied, speed, now, targets, step, theta)
+    v, b = found.speed, relied.braking[i]
+    after = speed_after(found.to_stop, np.zeros(len(v)), v, b, step, theta)
+    late = found.to_stop < found.way - _LENGTH
+    late |= ((targets.kind == TRAIN) | (targets.kind == OPPOSING)) & (targets.room < params.emergency_distance_m)
 
     rate = (after - v) / step
     if stop.any():
-        service = speed_after(room[stop], np.zeros(int(stop.sum())), v[stop], params.service_mps2, step, theta)
-        rate[stop] = _planned(rate[stop], (service - v[stop]) / step, params.service_mps2)
-    return np.where(late, -np.inf, rate)
+        planned = np.minimum(params.service_mps2, b[stop])
+        service = speed_after(found.room[stop], np.zeros(int(stop.sum())), v[stop], planned, step, theta)
+        rate[stop] = _planned(rate[stop], (service - v[stop]) / step, planned)
+    return np.where(late, -np.inf, rate - relied.scatter[i])
 
 
-def _before_limits(params: Params, speed: Floats, limits: Limits, step: float, theta: float) -> Floats:
+def _before_limits(
+    params: Params, relied: Assumed, speed: Floats, now: Floats, limits: Limits, step: float, theta: float
+) -> Floats:
     """Greatest acceleration each limit leaves its train [m/s2], shape (k,)."""
-    v, top = speed[limits.train], speed[limits.train] + params.greatest_mps2 * step
+    settled = np.maximum(speed + relied.lag * now, 0.0) if relied.lag.any() else speed
+    train = limits.train
+    v, top = settled[train], settled[train] + (params.greatest_mps2 + relied.scatter[train]) * step
     rate = np.full(len(v), np.inf)
     # Most rows do not bind, and are told cheaply: the limit is not below any speed to come, or farther than any braking for it.
-    near = np.flatnonzero((limits.speed < top) & (limits.distance < 0.5 * top**2 / params.service_mps2 + 4.0 * step * top))
-    v, room, limit = v[near], limits.distance[near], limits.speed[near]
-    emergency, service = (
-        (speed_after(room, limit, v, b, step, theta) - v) / step for b in (params.emergency_mps2, params.service_mps2)
+    planned = np.minimum(params.service_mps2, relied.braking)
+    # An actuator's lag dies away: from the braking rate to a speed error of 5 cm/s in so many seconds.
+    late = relied.lag * np.log(np.maximum(relied.lag * planned / 0.05, 1.0))
+    sooner = relied.uncertainty + late * np.maximum(speed, settled)
+    far = (
+        0.5 * top**2 / planned[train] + 4.0 * step * top + sooner[train] + relied.drift[train] * (top / planned[train] + 2.0 * step)
     )
-    rate[near] = _planned(emergency, service, params.service_mps2)
+    near = np.flatnonzero((limits.speed < top) & (limits.distance < far))
+    i, v, limit = train[near], v[near], limits.speed[near]
+    slower = relied.drift[i] * (np.maximum(v - limit, 0.0) / planned[i] + 2.0 * step)
+    room = limits.distance[near] - sooner[i] - slower
+    emergency, service = ((speed_after(room, limit, v, b[i], step, theta) - v) / step for b in (relied.braking, planned))
+    rate[near] = _planned(emergency, service, planned[i]) - relied.scatter[i]
     return rate
 
 
-def _planned(emergency: Floats, service: Floats, service_mps2: float) -> Floats:
-    """Greatest acceleration with the service brake as far as it goes, beyond it as late as the emergency brake allows."""
-    return np.minimum(emergency, np.maximum(service, -service_mps2))
+def _planned(emergency: Floats, service: Floats, planned: Floats) -> Floats:
+    """Greatest acceleration with the planned braking as far as it goes, beyond it as late as full braking allows."""
+    return np.minimum(emergency, np.maximum(service, -planned))
 
 
 def applied(verdict: Verdict, demanded: Floats) -> tuple[Floats, Bools]:

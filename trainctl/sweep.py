@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 from trainctl.errors import InputError, TrainctlError
 from trainctl.reading import examine, find, read, shipped
-from trainctl.sweep_results import RESULTS, reasons, wilson, write_results
+from trainctl.sweep_results import COUNTS, RESULTS, reasons, wilson, write_results
 
 FORMAT = "trainctl sweep"
 INFO, ROWS, FIGURE = "sweep.json", "rows.jsonl", "summary.png"
@@ -258,7 +258,8 @@ def _outcome(job: Job, folder: Path) -> dict[str, Any]:
     p = prepared(job)
     done = runner.run(p, folder, job.backend, job.keep is not None)  # type: ignore[arg-type]
     values = {key: value for key, value in done.metrics.items() if "/" not in key and isinstance(value, int | float)}
-    return {"status": "complete", "failure": None, "violations": done.info["violations"], "metrics": plain(values)}
+    told = {key: done.info[key] for key in COUNTS}
+    return {"status": "complete", "failure": None, **told, "metrics": plain(values)}
 
 
 # All runs
@@ -339,6 +340,7 @@ def sweep(
             "status": status,
             **counts,
             "violated": violated,
+            **{f"with_{name}": sum(bool(row.get(name)) for row in ordered) for name in ("collisions", "gridlocks")},
             "reasons": reasons(ordered),
             "wall_time_s": round(time.perf_counter() - began, 3),
         }

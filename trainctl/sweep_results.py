@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 #: The dataset in the folder of a sweep.
 RESULTS = "results.parquet"
 
+#: What every complete run counts, see run.json.
+COUNTS = ("violations", "collisions", "overspeeds", "gridlocks")
+
 #: Quantile of the normal distribution for an interval of 95 %.
 Z_95 = 1.959963984540054
 
@@ -41,7 +44,7 @@ def write_results(rows: Sequence[Mapping[str, Any]], path: Path) -> pd.DataFrame
     metrics = sorted({key for row in rows for key in row.get("metrics") or {}})
     columns: dict[str, list[Any]] = {"run": [row["run"] for row in rows]}
     columns |= {key: [_plain(row["parameters"].get(key)) for row in rows] for key in parameters}
-    columns |= {key: [row.get(key) for row in rows] for key in ("status", "failure", "violations")}
+    columns |= {key: [row.get(key) for row in rows] for key in ("status", "failure", *COUNTS)}
     columns |= {key: [(row.get("metrics") or {}).get(key) for row in rows] for key in metrics if key not in columns}
     arrays = {key: _column(column, pa.float64() if key in metrics else None) for key, column in columns.items()}
     table = pa.table(arrays).replace_schema_metadata({"schema_version": str(SCHEMA_VERSION), "table": "sweep"})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -66,6 +66,9 @@ class World(Protocol):
     def messages(self) -> list[tuple[float | None, str]]:
         """Warnings the simulator gave, with the time each names, if any; complete after ``close``."""
 
+    def collisions(self) -> list[dict[str, Any]]:
+        """Collisions the simulator counted, complete after ``close``: time_s, trains (the one run into first), edge, edge_m."""
+
 
 def lay_out(line: Line, start: Start) -> Ways:
     """The ways of trains that start."""
@@ -122,5 +125,9 @@ class Numeric:
         """Nothing to end."""
 
     def messages(self) -> list[tuple[float | None, str]]:
+        """None."""
+        return []
+
+    def collisions(self) -> list[dict[str, Any]]:
         """None."""
         return []

@@ -107,7 +107,7 @@ def test_a_file_is_replaced_whole(tmp_path):
 
 def test_every_array_of_the_loop_is_in_a_checkpoint(tmp_path):
     """Whoever adds an array to the loop or to the motion of units has to say whether it changes."""
-    fixed = {"p", "line_track", "gradient", "breaks", "masses", "plant", "signals", "parts"}
+    fixed = {"p", "line_track", "gradient", "breaks", "masses", "plant", "signals", "parts", "lag"}
     fixed |= {"orders"}  # written anew in every step before they are read
     prepared = open_scenario("fault_tolerant_noise", {"run.duration_s": 3})
     with opened(prepared, tmp_path / "run", "numeric") as simulation:
@@ -146,9 +146,9 @@ def test_every_array_of_trains_that_come_and_go_is_in_a_checkpoint(tmp_path):
         service = simulation.service
         kept = {id(array) for _, array in leaves("x", checkpoint.state(simulation)[1]["service"])}
         lost = {name for name, value in vars(service).items() if any(id(array) not in kept for _, array in leaves("x", value))}
-        assert lost == {"roster", "cruise"}  # as they were read
+        assert lost == {"roster", "cruise", "assumed"}  # as they were read
         lookout = {name for name, value in vars(simulation.lookout).items() if list(leaves("x", value))}
-        assert lookout == {"net", "length", "factor", "ways", "zones", "waits_for"}
+        assert lookout == {"net", "length", "factor", "ways", "zones", "waits_for", "assumed", "rate"}
 
 
 @pytest.mark.parametrize("own_line", [False, True])

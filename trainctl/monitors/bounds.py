@@ -1,49 +1,61 @@
 """What must hold is watched while a run goes on: the first time anything breaks becomes an event; the metrics count afterwards.
 
 Watched: speed and input bounds, link spacings, the constrained quantities of continuous laws, couplers, trains inside one another,
-connected formations, and the balance of energies. That SUMO moved every train just as far as it was told is watched by the world
-itself, and ends the run.
+the line's speed limits, connected formations, and the balance of energies; and who waits for whom. That SUMO moved every train just
+as far as it was told is watched by the world itself, and ends the run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from trainctl.monitors import on_track, waiting
 from trainctl.monitors.energy import Balance
+from trainctl.monitors.on_track import ROUNDING
+from trainctl.monitors.outcome import Tally
+from trainctl.monitors.waiting import Wait, Waiting
 from trainctl.signals import Floats, Ints
 
 if TYPE_CHECKING:
+    from trainctl.lookout import View
     from trainctl.prepare import Prepared
     from trainctl.record.journal import Row
-
-#: Rounding of positions on a line of some hundred kilometres, as SUMO hands them back.
-ROUNDING = 1e-6
+    from trainctl.service import Service
+    from trainctl.topology.claims import Held
+    from trainctl.topology.ways import Ways
+    from trainctl.world import Seen
 
 Alarm = dict[str, Any]
 
 
+def _alarm(bound: str, who: str, value: float, limit: float) -> Alarm:
+    return {"bound": bound, "who": who, "value": value, "limit": limit}
+
+
 class Alarms:
-    """Which bounds have been broken so far, and how often (steps).
+    """What has been broken so far, and how often (steps).
 
     Attributes
     ----------
-    count : dict
-        (bound, who) -> number of steps or rows in which it was broken.
-    first : dict or None
-        The first violation: time [s], bound, who, value, limit.
+    tally : Tally
+        What was broken, how often, and the worst of it.
+    watch : Watch
+        Trains inside one another, and too fast for their line.
+    waiting : Waiting
+        Who waits for whom.
     """
 
     def __init__(self, p: Prepared) -> None:
         n = len(p.scenario.train)
         self.p = p
-        self.count: dict[tuple[str, str], int] = {}
-        self.first: Alarm | None = None
-        self.neighbours: Ints = np.zeros((2, 0), np.int64)  # (ahead, behind) on one track, a step ago
-        self.length = p.consists.train_length()
+        self.tally = Tally()
+        self.watch = on_track.of(p)
+        self.waiting = Waiting(p.scenario.ids, p.line.edges, p.driving.wait_limit_s)
         units = p.scenario.plant.kind != "point"
         self.watched: tuple[str, ...] = tuple(getattr(p.law, "WATCHED", ())) if units and not p.sampled else ()
         # (lower and upper, n, q): of the interval the extremes are of, and of the present links
@@ -51,17 +63,17 @@ class Alarms:
         self.during, self.now = free, free.copy()
         self.energy = Balance(p) if units else None
 
-    @property
-    def total(self) -> int:
-        """Number of bounds broken at least once."""
-        return len(self.count)
+    def new(self, row: Row, ways: Ways, here: Seen) -> Iterator[Alarm]:
+        """What is broken in this row for the first time, as fields of an event; ``here`` is where the world has the trains."""
+        for alarm in chain(self._all(row), self.watch.broken(ways, here, row.speed)):
+            yield from self.tally.once(row.time, **alarm)
 
-    def new(self, row: Row) -> Iterator[Alarm]:
-        """Bounds broken in this row for the first time, as fields of an event."""
-        for alarm in self._all(row):
-            if self.first is None:
-                self.first = {"time_s": row.time, **alarm}
-            yield alarm
+    def counted(self, end: float, collisions: Sequence[Mapping[str, Any]]) -> Iterator[tuple[float, Alarm]]:
+        """Time [s] and fields of events for the collisions of ``World.collisions`` that were not told before."""
+        for found in collisions:
+            at = end if found["time_s"] is None else found["time_s"]
+            for alarm in self.tally.counted(at, found):
+                yield at, alarm
 
     def relinked(self, time: float, groups: Sequence[Sequence[int]], formation: Ints, scene: Any) -> Iterator[Alarm]:
         """Take over the law's bounds on new links; a formation that is in pieces is told.
@@ -90,10 +102,7 @@ class Alarms:
         pairs = np.unique(np.stack([whole, piece]), axis=1)[0]
         for key in np.unique(pairs[1:][pairs[1:] == pairs[:-1]]).tolist():
             who = ",".join(self.p.scenario.ids[i] for i in np.flatnonzero(whole == key))
-            for alarm in self._once("connected_pieces", who, float((pairs == key).sum()), 1.0):
-                if self.first is None:
-                    self.first = {"time_s": time, **alarm}
-                yield alarm
+            yield from self.tally.once(time, bound="connected_pieces", who=who, value=float((pairs == key).sum()), limit=1.0)
 
     def _all(self, row: Row) -> Iterator[Alarm]:
         ids, bounds, speed = self.p.scenario.ids, self.p.bounds, row.speed
@@ -107,8 +116,6 @@ class Alarms:
         yield from self._couplers(row)
         yield from self._constrained(row)
         yield from self._energies(row)
-        if self.p.roster is None and self.p.supervision.mode == "off":  # otherwise ``overlaps`` tells, edge by edge
-            yield from self._collisions(row)
         links = row.links
         spacing = row.seen.position[links.sender] - row.seen.position[links.receiver]
         ahead = spacing > 0.0  # each pair once
@@ -117,7 +124,7 @@ class Alarms:
             ("spacing_upper_m", links.upper, spacing > links.upper + ROUNDING),
         ):
             for k in np.flatnonzero(broken & ahead).tolist():
-                yield from self._once(key, f"{ids[links.sender[k]]}-{ids[links.receiver[k]]}", float(spacing[k]), float(bound[k]))
+                yield _alarm(key, f"{ids[links.sender[k]]}-{ids[links.receiver[k]]}", float(spacing[k]), float(bound[k]))
 
     def _couplers(self, row: Row) -> Iterator[Alarm]:
         """Couplers beyond their range in any sub-step since the last row."""
@@ -130,7 +137,7 @@ class Alarms:
         ):
             for u in np.flatnonzero(broken).tolist():
                 i = int(np.searchsorted(p.consists.first, u, side="right")) - 1
-                yield from self._once(key, f"{p.scenario.ids[i]}.{u - p.consists.first[i] + 1}", float(value[u]), bound)
+                yield _alarm(key, f"{p.scenario.ids[i]}.{u - p.consists.first[i] + 1}", float(value[u]), bound)
 
     def _constrained(self, row: Row) -> Iterator[Alarm]:
         """The law's own constrained quantities in any sub-step since the last row, against the bounds that held then."""
@@ -150,65 +157,54 @@ class Alarms:
         ):
             for i, q in np.argwhere(broken).tolist():
                 stem, _, unit = self.watched[q].rpartition("_")
-                yield from self._once(f"{stem}_{side}_{unit}", self.p.scenario.ids[i], float(value[i, q]), float(bound[i, q]))
+                yield _alarm(f"{stem}_{side}_{unit}", self.p.scenario.ids[i], float(value[i, q]), float(bound[i, q]))
 
     def _energies(self, row: Row) -> Iterator[Alarm]:
         """Trains whose energy changes by something else than what is accounted for."""
         if self.energy is None:
             return
         for i, share in self.energy.broken(row):
-            yield from self._once("energy_balance_share", self.p.scenario.ids[i], share, self.energy.LIMIT)
+            yield _alarm("energy_balance_share", self.p.scenario.ids[i], share, self.energy.LIMIT)
 
-    def overlaps(self, time: float, room: Floats, body: Ints) -> Iterator[Alarm]:
-        """Trains inside one another: ``room`` (n,) [m] from each front to the train ``body`` (n,) ahead on its way."""
-        for i in np.flatnonzero(room < -ROUNDING).tolist():
-            for alarm in self._once("gap_m", f"{self.p.scenario.ids[body[i]]}-{self.p.scenario.ids[i]}", float(room[i]), 0.0):
-                if self.first is None:
-                    self.first = {"time_s": time, **alarm}
-                yield alarm
+    def waits(
+        self, t: float, here: Seen, speed: Floats, view: View, held: Held, service: Service | None, out: Mapping[int, int]
+    ) -> Iterator[tuple[str, Alarm]]:
+        """Long waits and circles, as kind and fields of events; arguments as of ``waiting.waits`` and ``waiting.entries``."""
+        p, found, due = self.p, list[Wait](), dict[int, float]()
+        rules = p.supervision if service is None else service.rules
+        own_stop = np.zeros(len(speed), bool) if service is None else service.standing
+        if service is not None or rules.mode == "on":  # otherwise nothing keeps a train from going on
+            assumed = p.assumed if service is None else service.assumed
+            found = waiting.waits(view, held, here, speed, rules, assumed, p.scenario.run.step_s, p.step_theta, own_stop)
+        if service is not None:
+            entries = waiting.entries(service, t, held, out)
+            due = {w.train: float(service.roster.depart[w.train]) for w in entries}
+            found += entries
+        yield from self.waiting.new(t, found, due)
 
-    def _collisions(self, row: Row) -> Iterator[Alarm]:
-        """Trains inside one another, whatever the law: in the order of the step before, so that passing through is seen too."""
-        before, self.neighbours = self.neighbours, self._neighbours(row)
-        for ahead, behind in (before,) if self.neighbours is before else (before, self.neighbours):
-            gap = row.seen.position[ahead] - self.length[ahead] - row.seen.position[behind]
-            for k in np.flatnonzero((row.track[ahead] == row.track[behind]) & (gap < -ROUNDING)).tolist():
-                yield from self._once(
-                    "gap_m", f"{self.p.scenario.ids[ahead[k]]}-{self.p.scenario.ids[behind[k]]}", float(gap[k]), 0.0
-                )
-
-    def _neighbours(self, row: Row) -> Ints:
-        """Pairs of trains next to each other on one track; those of the step before (the same array), where they still hold."""
-        x, track, (ahead, behind) = row.seen.position, row.track, self.neighbours
-        pieces, tracks = len(track) - len(ahead), np.count_nonzero(np.bincount(track))
-        if pieces == tracks and (track[ahead] == track[behind]).all() and (x[ahead] >= x[behind]).all():
-            return self.neighbours
-        order = np.lexsort((-x, track))
-        beside = track[order[:-1]] == track[order[1:]]
-        return np.stack([order[:-1][beside], order[1:][beside]])
+    def outcome(self, not_entered: int) -> dict[str, Any]:
+        """What run.json says of a finished run; ``not_entered`` trains were due and never came."""
+        more = {"gridlocks": len(self.waiting.circles), "waited_long": self.waiting.long, "not_entered": not_entered}
+        return self.tally.outcome(self.p.supervision.mode == "on", more)
 
     def _per_train(self, key: str, value: Floats, bound: Floats, broken: Any) -> Iterator[Alarm]:
         for i in np.flatnonzero(broken).tolist():
-            yield from self._once(key, self.p.scenario.ids[i], float(value[i]), float(bound[i]))
-
-    def _once(self, key: str, who: str, value: float, bound: float) -> Iterator[Alarm]:
-        seen = self.count.get((key, who), 0)
-        self.count[key, who] = seen + 1
-        if not seen:
-            yield {"bound": key, "who": who, "value": value, "limit": bound}
+            yield _alarm(key, self.p.scenario.ids[i], float(value[i]), float(bound[i]))
 
     def values(self) -> dict[str, Any]:
         """What it remembers, as plain JSON; the rest is in ``arrays``."""
-        return {"count": [[*key, number] for key, number in self.count.items()], "first": self.first}
+        return {"tally": self.tally.values(), "waiting": self.waiting.values()}
 
     def arrays(self) -> tuple[NDArray[Any], ...]:
         """Arrays it remembers."""
-        return (self.neighbours, self.during, self.now, *(self.energy.arrays() if self.energy else ()))
+        return (
+            self.watch.last, self.during, self.now, *self.waiting.arrays(), *(self.energy.arrays() if self.energy else ()),
+        )  # fmt: skip
 
     def restore(self, values: dict[str, Any], arrays: Sequence[NDArray[Any]]) -> None:
         """Remember what ``values`` and ``arrays`` told."""
-        self.count = {(key, who): number for key, who, number in values["count"]}
-        self.first = values["first"]
-        self.neighbours, self.during, self.now = (a.copy() for a in arrays[:3])
+        self.tally.restore(values["tally"])
+        self.watch.last, self.during, self.now = (a.copy() for a in arrays[:3])
+        self.waiting.restore(values["waiting"], arrays[3:5])
         if self.energy is not None:
-            self.energy.restore(arrays[3:])
+            self.energy.restore(arrays[5:])

@@ -133,14 +133,16 @@ class Disturbance(Table):
         """Trains named; ("all",) for all."""
         return tuple(str(t) for t in self.train) if isinstance(self.train, tuple) else (str(self.train),)
 
-    def greatest(self, trains: Sequence[str]) -> Floats:
+    def greatest(self, trains: Sequence[str], deviations: float = math.inf) -> Floats:
         """Greatest magnitude on each channel of each of all ``trains``, shape (5, n).
 
-        Windows in time and place are ignored. A Gaussian that no amplitude cuts off has no bound: inf. The row of the resistance is
-        a relative error, not a factor.
+        Windows in time and place are ignored. A Gaussian that no amplitude cuts off has no bound: it is taken to stay within so
+        many standard ``deviations``. The row of the resistance is a relative error, not a factor.
         """
         given = getattr(self, self.amplitude_key)
-        return self._spread(trains, math.inf if given is None else given, np.abs)
+        if given is None:
+            given = math.inf if math.isinf(deviations) else deviations * np.asarray(getattr(self, self.std_key), float)
+        return self._spread(trains, given, np.abs)
 
     def steady(self, trains: Sequence[str]) -> Floats | None:
         """Value on each channel of each of all ``trains``, shape (5, n), if it never changes; else None."""
@@ -148,7 +150,7 @@ class Disturbance(Table):
             return None
         return self._spread(trains, getattr(self, self.amplitude_key), np.positive)
 
-    def _spread(self, trains: Sequence[str], value: PerTrain, kind: Callable[[Floats], Floats]) -> Floats:
+    def _spread(self, trains: Sequence[str], value: PerTrain | Floats, kind: Callable[[Floats], Floats]) -> Floats:
         index = {name: i for i, name in enumerate(trains)}
         places = [index[name] for name in (trains if self.trains == ("all",) else self.trains)]
         out = np.zeros((len(CHANNELS), len(trains)))
@@ -211,6 +213,11 @@ class Disturbed(NamedTuple):
     input: Floats  # w3 [m/s2]
     resistance: Floats  # true over believed resistance, 1 if undisturbed
     measurement: Floats  # measured minus true position [m]
+
+    def calm(self) -> Disturbed:
+        """The same step without what disturbs the motion: what can be known of it before."""
+        none = np.zeros_like(self.position)
+        return Disturbed(none, none, none, np.ones_like(none), self.measurement)
 
 
 # Columns of Signals.whole. The steps of a row count from BEGIN, its table is table[START:END]; the rest are words of the generator.

@@ -23,7 +23,7 @@ from numba.extending import overload
 from trainctl.errors import LawError
 from trainctl.kernels import bare
 from trainctl.plants import shared
-from trainctl.signals import FORCE, POWERS, Floats, Ints, Links, Reference, leader_at
+from trainctl.signals import FORCE, POSITION, POWERS, SPEED, Floats, Ints, Links, Reference, leader_at
 
 types: Any = numba.types
 typeof: Any = numba.typeof
@@ -316,7 +316,18 @@ def stretch(code, loop, first, length, links, reference, air, t, h, n, breaks, o
                 along(energy, energy, (dt if s in (0, 3) else 2.0 * dt) / 6.0, power)
             along(x, x_0, dt / 6.0, x_sum)
             along(q, q_0, dt / 6.0, q_sum)
+            stay(x, x_0)
             begin = stop
+
+
+@bare(inline="always")
+def stay(own, before):  # type: ignore[no-untyped-def]
+    """Hold units at standstill that a step would have driven backwards: neither speed nor position falls below it."""
+    for u in range(len(own)):
+        if own[u, SPEED] < 0.0:
+            own[u, SPEED] = 0.0
+            if own[u, POSITION] < before[u, POSITION]:
+                own[u, POSITION] = before[u, POSITION]
 
 
 def part(code: str, owner: int, name: str) -> Any:

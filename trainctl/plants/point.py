@@ -131,7 +131,7 @@ def resistance(speed: Floats, davis: Floats) -> Floats:
 
     Notes
     -----
-    As printed, so ``c0`` acts at standstill too: a clamp of the speed at 0 keeps a stopped train where it is.
+    As printed, so ``c0`` acts at standstill too, where the plant holds the train.
     """
     return davis[:, 0] + davis[:, 1] * speed + davis[:, 2] * speed**2
 
@@ -177,7 +177,8 @@ def advance(constants: Constants, own: Floats, acceleration: Floats, step: float
     Notes
     -----
     The order of (4): add w3, clamp the input, subtract the true resistance, add w2, clamp the speed. Departs from both papers
-    in two things: a displacement below zero is clipped to 0, since trains on a network do not run backwards, and the gradient.
+    in two things: the gradient, and standstill. Trains on a network do not run backwards, so neither a speed nor a displacement
+    falls below 0, and a train that stands is not moved by a disturbance of its position: its brakes hold it.
     """
     moved = Moved(np.empty_like(own), *np.empty((2, len(own))), *np.empty((2, len(own)), dtype=bool))
     climb = climbing(own[:, POSITION], constants.gradient) + GRAVITY * constants.slope
@@ -195,9 +196,9 @@ def _advance(constants: Constants, own: Floats, climb: Floats, acceleration: Flo
         asked = believed + climb[i] + acceleration[i] + kick.input[i]
         applied = np.minimum(np.maximum(asked, c.input_lower[i]), c.input_upper[i])
         free = v + applied * step - (c.resistance_factor[i] * believed + climb[i]) * step + kick.speed[i]
-        v_next = np.minimum(np.maximum(free, c.speed_lower[i]), c.speed_upper[i])
+        v_next = np.minimum(np.maximum(np.maximum(free, c.speed_lower[i]), 0.0), c.speed_upper[i])
         distance = v * step + kick.position[i]
-        displacement = np.maximum(distance, 0.0)
+        displacement = np.maximum(distance, 0.0) if v > 0.0 else 0.0 * v  # what is not a number stays that
         moved.own[i, POSITION], moved.own[i, SPEED] = own[i, POSITION] + displacement, v_next
         moved.input[i], moved.displacement[i] = applied, displacement
         moved.limited[i] = applied != asked or v_next != free

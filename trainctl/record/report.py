@@ -13,6 +13,7 @@ from trainctl.errors import InputError
 from trainctl.record.figures_trains import Drawn, prepare
 from trainctl.record.folder import plain
 from trainctl.record.metrics import DEFINITIONS, SLACK, metrics
+from trainctl.record.outcome import summary
 from trainctl.record.report_animation import animation
 from trainctl.record.report_panels import panels
 from trainctl.record.run import Run
@@ -87,7 +88,7 @@ def page(run: Run) -> str:
         "script": _template("report.js"),
         "data": _inline(data),
         "about": _about(drawn),
-        "verdict": _verdict(values),
+        "verdict": _outcome(drawn.run) + _verdict(values, drawn.run),
         "bounds": _bounds(values),
         "figures": _figures(values),
         "events": _events(film),
@@ -148,12 +149,24 @@ def _margins(values: Mapping[str, Any]) -> list[tuple[str, str, float, str]]:
     return found
 
 
-def _verdict(values: Mapping[str, Any]) -> str:
+def _outcome(run: Run) -> str:
+    """What failed the run, and what is to be known besides: as on the terminal."""
+    lines = summary(run)[:-1] if "violations" in run.info else []
+    return "".join(
+        f'<p class="verdict{" broken" if line.failed else ""}"><strong>{escape(line.title.capitalize())}</strong>:'
+        f" {escape(line.text)}</p>"
+        for line in lines
+    )
+
+
+def _verdict(values: Mapping[str, Any], run: Run) -> str:
     """All bounds held, or which broke first, where and when."""
     margins = _margins(values)
     broken = [words for words, _, margin, _ in margins if margin < -SLACK]
     if not margins:
         return '<p class="verdict"><strong>No bounds</strong> are stated in this scenario.</p>'
+    if not broken and run.info.get("checks_failed"):
+        return f'<p class="verdict">None of {len(margins)} kinds of bound was broken at a recorded instant.</p>'
     if not broken:
         return f'<p class="verdict held"><strong>All bounds held</strong> ({len(margins)} kinds, at every recorded instant).</p>'
     first = ""

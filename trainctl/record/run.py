@@ -56,6 +56,16 @@ class Run:
         """Folder, status and size in one line."""
         return f"Run({str(self.folder)!r}, {self.info.get('status')}, {self.info.get('steps', '?')} steps)"
 
+    @property
+    def ok(self) -> bool:
+        """Whether the run is complete and nothing failed it: no collision, no gridlock, with the supervisor on no overspeed."""
+        return self.info.get("status") == "complete" and not self.info.get("checks_failed")
+
+    @property
+    def collisions(self) -> int:
+        """Pairs of trains that collided."""
+        return int(self.info.get("collisions", 0))
+
     @cached_property
     def trains(self) -> pd.DataFrame:
         """One row per step and train."""

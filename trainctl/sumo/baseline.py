@@ -24,6 +24,8 @@ import numpy as np
 from trainctl import supervisor
 from trainctl.controllers.sumo import BRAKING_MPS2
 from trainctl.errors import CouplingError, InputError, SimulatorError
+from trainctl.monitors import on_track
+from trainctl.monitors.outcome import Tally
 from trainctl.plants import point
 from trainctl.prepare import Prepared
 from trainctl.record.folder import about_run, claim, finish, held, remove, write_info, write_json
@@ -33,7 +35,7 @@ from trainctl.record.run import Run
 from trainctl.reroute import Reroutes
 from trainctl.signals import GRAVITY, POWERS, Bools, Floats, Ints
 from trainctl.sumo.baseline_files import departures, network, write_configuration, write_routes
-from trainctl.sumo.session import LOGS, TOLERANCE_M, messages, normal
+from trainctl.sumo.session import LOGS, TOLERANCE_M, collisions, messages, normal
 from trainctl.topology.ways import rerouted, ways
 from trainctl.world import Seen
 
@@ -61,6 +63,11 @@ class State(NamedTuple):
     def present(self) -> Ints:
         """Trains on the net."""
         return np.flatnonzero(self.edge >= 0)
+
+    @property
+    def seen(self) -> Seen:
+        """The same as the loop has it."""
+        return Seen(self.position, self.edge, self.row, self.edge >= 0)
 
 
 class Body(NamedTuple):
@@ -126,7 +133,8 @@ def run(
         try:
             session = Session(p, partial)
             session.run(progress)
-            end = {"steps": session.k, "violations": len(session.broken), "first_violation": session.first}
+            missing = {"not_entered": len(session.missing)}
+            end = {"steps": session.k, **session.tally.outcome(supervised=False, more=missing)}
             write_json(partial / "metrics.json", metrics(Run(partial)))
         except BaseException as error:
             if isinstance(error, InputError):
@@ -157,10 +165,12 @@ class Session:
     ----------
     k : int
         Steps done.
-    broken : set
-        (bound, who) that have been broken.
-    first : dict or None
-        The first of them.
+    tally : Tally
+        What has been broken.
+    watch : Watch
+        Trains inside one another, and too fast for their line.
+    missing : list of str
+        Trains that never entered.
     """
 
     def __init__(self, p: Prepared, folder: Path) -> None:
@@ -180,8 +190,8 @@ class Session:
         self.reroutes = Reroutes(replace(p, scenario=p.scenario.model_copy(update={"supervisor": protected})))
         self.entered: Bools = np.zeros(len(self.number), bool)
         self.energy = np.zeros((len(self.number), len(POWERS)))
-        self.broken: set[tuple[str, str]] = set()
-        self.first: dict[str, Any] | None = None
+        self.tally, self.watch = Tally(), on_track.of(p, self.line)
+        self.missing: list[str] = []
         self.k = 0
         write_routes(p, self.departures, self.place / "trains.rou.xml")
         self.configuration = write_configuration(p, self.net.name, self.place)
@@ -204,6 +214,9 @@ class Session:
                     libsumo.close()
             for at, message in messages(self.place / LOGS["log"]):
                 self.event(self.time if at is None else at, "sumo_warning", message=message)
+            for found in collisions(self.place / LOGS["collision-output"], self.number):
+                for told in self.tally.counted(found["time_s"], found):
+                    self.event(found["time_s"], "violation", **told)
 
     def _start(self) -> None:
         if libsumo.simulation.isLoaded():
@@ -237,9 +250,9 @@ class Session:
                 progress(self.k, steps)
         self._watch(now, np.full(len(self.number), np.nan))
         self._record(now, np.full(len(self.number), np.nan), last=True)
-        waiting = [name for name, i in self.number.items() if not self.entered[i]]
-        if waiting:
-            self.event(self.time, "not_entered", trains=waiting)
+        self.missing = [name for name, i in self.number.items() if not self.entered[i]]
+        if self.missing:
+            self.event(self.time, "not_entered", trains=self.missing)
 
     def _read(self) -> State:
         """Where SUMO has the trains."""
@@ -314,9 +327,8 @@ class Session:
         """Order the reroutes whose time, place or condition has come."""
         if not self.reroutes.pending:
             return
-        seen = Seen(now.position, now.edge, now.row, now.edge >= 0)
         journal: Any = self  # takes the events
-        for i, edges in self.reroutes.orders(self.time, seen, self.ways, now.speed, now.ahead, journal):
+        for i, edges in self.reroutes.orders(self.time, now.seen, self.ways, now.speed, now.ahead, journal):
             self._call(libsumo.vehicle.setRoute, self.p.scenario.ids[i], normal(edges))
             onward, before = [self.line.index[e] for e in edges], self.ways.first[:-1]
             self.ways = rerouted(self.ways, i, int(now.row[i]), onward, self.line.start_m, self.line.length_m)
@@ -337,23 +349,20 @@ class Session:
                 self.event(self.time, "join", train=name, track=new)
 
     def _watch(self, now: State, force: Floats) -> None:
-        """The scenario's bounds and collisions; the first time anything breaks is an event, as in other runs."""
-        bounds, ids, ahead = self.p.bounds, self.p.scenario.ids, now.ahead
-        gap = now.spacing - self.length[ahead]
+        """The scenario's bounds, collisions and speed limits; the first time anything breaks is an event, as in other runs."""
+        bounds, ids = self.p.bounds, self.p.scenario.ids
         for bound, value, limit, broken in (
             ("speed_lower_mps", now.speed, bounds.speed_lower, now.speed < bounds.speed_lower - ROUNDING),
             ("speed_upper_mps", now.speed, bounds.speed_upper, now.speed > bounds.speed_upper + ROUNDING),
             ("input_lower_mps2", force, bounds.input_lower, force < bounds.input_lower - ROUNDING),
             ("input_upper_mps2", force, bounds.input_upper, force > bounds.input_upper + ROUNDING),
-            ("gap_m", gap, np.zeros_like(gap), gap < -ROUNDING),
         ):
             for i in np.flatnonzero(broken).tolist():
-                who = f"{ids[ahead[i]]}-{ids[i]}" if bound == "gap_m" else ids[i]
-                if (bound, who) not in self.broken:
-                    self.broken.add((bound, who))
-                    told = {"bound": bound, "who": who, "value": float(value[i]), "limit": float(limit[i])}
-                    self.first = self.first or {"time_s": self.time, **told}
+                for told in self.tally.once(self.time, bound, ids[i], float(value[i]), float(limit[i])):
                     self.event(self.time, "violation", **told)
+        for wrong in self.watch.broken(self.ways, now.seen, now.speed):
+            for told in self.tally.once(self.time, **wrong):
+                self.event(self.time, "violation", **told)
 
     def _record(self, now: State, force: Floats, last: bool = False) -> None:
         if self.k % self.p.scenario.run.recorded_steps and not last:

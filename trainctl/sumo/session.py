@@ -11,7 +11,7 @@ import os
 import re
 import sys
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ import numpy as np
 
 from sumo_net import Line
 from trainctl.errors import CouplingError, SimulatorError
+from trainctl.record.sumo_logs import elements
 from trainctl.signals import Bools, Floats, Ints, Links
 from trainctl.sumo.preflight import objections
 from trainctl.topology.ways import rerouted
@@ -146,6 +147,17 @@ def messages(log: Path) -> list[tuple[float | None, str]]:
         if text.startswith(("Warning:", "Error:")):
             at = re.search(r"time[= ]([0-9.]+)", text)
             found.append((float(at.group(1).rstrip(".")) if at else None, text))
+    return found
+
+
+def collisions(log: Path, ids: Container[str]) -> list[dict[str, Any]]:
+    """What SUMO counted as collisions, in its order: time_s, trains (the one run into first), edge, edge_m."""
+    found = []
+    for _, at in elements(log, "collisions", {"collision"}):
+        trains = [at["victim"], at["collider"]]
+        if all(name in ids for name in trains):
+            edge = at["lane"].rpartition("_")[0]
+            found.append({"time_s": float(at["time"]), "trains": trains, "edge": edge, "edge_m": float(at["pos"])})
     return found
 
 
@@ -360,6 +372,10 @@ class Sumo:
         """Warnings and errors SUMO wrote, with the time it named, if any."""
         found = messages(self.folder / LOGS["log"])
         return [(at, text) for at, text in found if not text.startswith(OF_IDLING)]
+
+    def collisions(self) -> list[dict[str, Any]]:
+        """Collisions SUMO counted, see ``World``."""
+        return collisions(self.folder / LOGS["collision-output"], self.ids)
 
     def _time(self) -> float:
         return float(self.api.simulation.getTime()) - self.time_step

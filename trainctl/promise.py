@@ -1,0 +1,334 @@
+"""What protection relies on, train by train: the conditions of its promise, computed from the scenario.
+
+The promise: with ``[supervisor] mode = "on"`` no law makes a train touch another, pass a place it must not pass, or exceed a speed
+limit, *if* every train can do what ``Assumed`` says of it. Running resistance is not counted on: it helps to brake, but not surely.
+
+Symbols
+-------
+b, given    full braking that is ordered; what brakes, slope and faults leave of it [m/s2]
+w1, w2, w3  maximum disturbance of position [m], speed [m/s] and input [m/s2]; T step [s]
+e R         maximum error of the running resistance at the line's own speed [m/s2]
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from trainctl import lookout, supervisor
+from trainctl.plants import disturbance, shared
+from trainctl.plants.faults import Fault
+from trainctl.signals import GRAVITY, POSITION, SPEED, Floats
+from trainctl.supervisor import Assumed
+from trainctl.topology import along
+from trainctl.topology.ways import ways
+
+if TYPE_CHECKING:
+    from trainctl.prepare import Prepared
+
+#: What has no bound is counted as this many standard deviations: exceeded once in 5e8 draws.
+DEVIATIONS = 6.0
+
+#: Trains that cannot be relied on to brake with at least this [m/s2] are not protected.
+LEAST_BRAKING = 0.02
+
+
+class Parts(NamedTuple):
+    """Where the numbers of ``Assumed`` come from, shape (n,) each."""
+
+    top: Floats  # m/s, the highest speed its line allows it
+    fall: Floats  # m/s2, of gravity on the steepest descent of its route
+    climb: Floats  # m/s2, on the steepest ascent
+    given: Floats  # m/s2, what brakes and slope leave of full braking, with all faults
+    input: Floats  # m/s2, w3, and a bias of faulty actuators
+    speed: Floats  # m/s2, w2 / T
+    resistance: Floats  # m/s2, e R
+    noise: Floats  # m/s2, of the plant
+    position: Floats  # m, w1 of a step
+    measured: Floats  # m, error of the position
+    lag: Floats  # s
+
+
+def top_speed(p: Prepared) -> Floats:
+    """Highest speed the line allows every train anywhere on its route, or that it starts with [m/s], shape (n,)."""
+    start = p.own[p.heads, SPEED]
+    if p.roster is None:
+        highest: Floats = np.maximum(float(p.line.speed_mps.max()), start)
+        return highest
+    limit, index = p.rails.speed_mps, p.line.index
+    routes = [float(limit[[index[e] for e in route]].max()) for route in p.roster.routes]
+    highest = np.array(routes) if not p.scenario.event else np.full(len(routes), limit.max())  # a reroute may lead anywhere
+    found: Floats = np.maximum(p.roster.speed_factor * highest, start)
+    return found
+
+
+def _slopes(p: Prepared) -> tuple[Floats, Floats]:
+    """Steepest descent and ascent of every train's route, rise / run >= 0, shape (n,)."""
+    if p.roster is None:
+        breaks, slope = p.line.gradient.breaks, p.line.gradient.slope
+        rear = p.own[p.heads, POSITION] - p.consists.train_length()
+        first = np.maximum(np.searchsorted(breaks, rear, side="right") - 1, 0)
+        ahead = [slope[k:] for k in first.tolist()]
+    elif p.scenario.event or not p.rails.slope.any():
+        ahead = [p.rails.slope] * len(p.roster.routes)
+    else:
+        ahead = [p.rails.slope[[p.line.index[e] for e in route]] for route in p.roster.routes]
+    down, up = (np.array([max(float((sign * s).max()), 0.0) for s in ahead]) for sign in (-1.0, 1.0))
+    return down, up
+
+
+def _faulty(p: Prepared) -> tuple[Floats, Floats]:
+    """Share of the demanded force every unit surely gives, and the greatest bias of its force [N], shape (U,)."""
+    share, bias = np.ones(len(p.consists.mass)), np.zeros(len(p.consists.mass))
+    faults: Sequence[Fault] = p.scenario.fault
+    for fault in faults:
+        u = int(p.consists.first[p.scenario.ids.index(fault.train)]) + fault.unit - 1
+        if fault.kind == "effectiveness":
+            share[u] *= fault.effectiveness or 0.0
+        else:
+            bias[u] += abs(fault.amplitude_n_per_s or 0.0) / p.consists.actuator_rate[u]
+    return share, bias
+
+
+def parts(p: Prepared) -> Parts:
+    """Numbers behind ``assume``, for every train of a scenario."""
+    n, c, run, b = len(p.scenario.ids), p.consists, p.scenario.run, p.supervision.emergency_mps2
+    top, (down, up) = top_speed(p), _slopes(p)
+    greatest = np.zeros((len(disturbance.CHANNELS), n))
+    for entry in p.scenario.disturbance:
+        greatest += entry.greatest(p.scenario.ids, DEVIATIONS)
+    davis, zero = c.train_davis(), np.zeros(n)
+    resistance = greatest[disturbance.RESISTANCE] * (davis[:, 0] + davis[:, 1] * top + davis[:, 2] * top**2)
+    found = Parts(
+        top=top, fall=GRAVITY * down, climb=GRAVITY * up, given=np.full(n, b), input=greatest[disturbance.INPUT],
+        speed=greatest[disturbance.SPEED] / run.step_s, resistance=resistance, noise=zero,
+        position=greatest[disturbance.POSITION], measured=greatest[disturbance.MEASUREMENT], lag=zero,
+    )  # fmt: skip
+    if p.scenario.plant.kind == "point":
+        return found._replace(given=np.minimum(b, p.sure_braking - found.fall))
+    share, bias = _faulty(p)
+    units, heads = np.diff(c.first), p.heads
+    inertia = c.mass * c.rotating
+    total = np.add.reduceat(inertia, heads)
+    force = np.minimum(c.braking, c.braking_power / np.maximum(np.repeat(top, units), 1e-9))
+    fall, weight = np.repeat(found.fall, units), np.add.reduceat(c.mass, heads)
+    given = np.add.reduceat(share * np.minimum(force, inertia * b + c.mass * fall), heads) - weight * found.fall
+    found = found._replace(given=given / total, input=found.input + np.add.reduceat(bias, heads) / total)
+    if p.scenario.plant.kind == "coupled_units":
+        return found
+    lag = np.maximum.reduceat(1.0 / c.actuator_rate, heads)
+    # Resistance falls as the train slows down, and the actuators follow late.
+    falling = lag * b * (davis[:, 1] + 2.0 * davis[:, 2] * top)
+    variance, hold = p.plant_params.noise_variance_m2_per_s6, p.plant_params.noise_hold_s
+    keeps = np.exp(-hold / lag)
+    noise = DEVIATIONS * math.sqrt(variance) * lag * np.sqrt((1.0 - keeps) / (1.0 + keeps))
+    return found._replace(lag=lag, noise=noise, resistance=found.resistance + falling)
+
+
+def _scatter(found: Parts) -> Floats:
+    """By how much an acceleration may miss what is ordered [m/s2], shape (n,)."""
+    return found.input + found.speed + found.resistance + found.noise
+
+
+def assume(p: Prepared) -> Assumed:
+    """What the supervisor relies on of every train of a scenario; ``refusals`` says where that cannot be met."""
+    found, rules, c = parts(p), p.supervision, p.consists
+    scatter = _scatter(found)
+    share, _ = _faulty(p)
+    traction = np.minimum(c.traction, c.traction_power / np.maximum(np.repeat(found.top, np.diff(c.first)), 1e-9))
+    if p.scenario.plant.kind == "point":
+        upper = p.plant_params.input_upper_mps2
+        pull = np.full(len(scatter), np.inf if upper is None else upper)
+    else:
+        pull = np.add.reduceat(share * traction, p.heads) / p.consists.train_mass()
+    coasting = shared.mean_resistance(c, found.top) + found.resistance + found.climb - pull  # uphill it may slow down by itself
+    kicks = 0.0 if p.scenario.plant.kind == "point" else 0.5 * found.speed * p.scenario.run.step_s  # before it moves, not after
+    return Assumed(
+        braking=np.maximum(np.minimum(found.given, rules.emergency_mps2) - scatter, LEAST_BRAKING),
+        hardest=np.maximum(rules.emergency_mps2 + scatter, coasting),
+        scatter=scatter,
+        drift=found.position / p.scenario.run.step_s + kicks + (rules.speed_uncertainty_mps or 0.0),
+        lag=found.lag,
+        uncertainty=found.measured + (rules.position_uncertainty_m or 0.0),
+        blur=rules.speed_uncertainty_mps or 0.0,
+    )
+
+
+def planned(assumed: Assumed, rate: float) -> Assumed:
+    """What a driver relies on who brakes with ``rate`` [m/s2]: he keeps away farther than the supervisor asks.
+
+    Behind a train of the same speed he brakes for ``D(v) - D(w)`` with the rates below: its difference is at least that of the
+    supervisor's rates. His positions are true ones, the supervisor's told room is less by up to the uncertainties.
+    """
+    braking = np.maximum(np.minimum(rate, assumed.braking + assumed.scatter) - assumed.scatter, LEAST_BRAKING)
+    weakest = int(np.argmin(1.0 / braking - 1.0 / assumed.braking))
+    ahead = braking[weakest] / (1.0 + braking[weakest] * (1.0 / assumed.hardest - 1.0 / assumed.braking[weakest]))
+    return assumed._replace(braking=braking, hardest=ahead, uncertainty=3.0 * assumed.uncertainty)
+
+
+def refusals(p: Prepared) -> list[str]:
+    """What of the promise cannot be kept in a scenario with ``mode = "on"``, with the numbers that would do."""
+    if p.supervision.mode != "on" or p.law.CLOCK == "none":
+        return []
+    clamp = p.plant_params.speed_lower_mps if p.scenario.plant.kind == "point" else None
+    if clamp is not None and clamp > 0.0:
+        return [
+            f"plant.speed_lower_mps = {clamp:g}: trains that cannot stand cannot be kept apart; with supervisor.mode = on it must"
+            " be 0 or less"
+        ]
+    return _weak(p) or _lost(p)
+
+
+def _weak(p: Prepared) -> list[str]:
+    """Trains that cannot be relied on to brake."""
+    found, assumed, b = parts(p), p.assumed, p.supervision.emergency_mps2
+    surely = np.minimum(found.given, b) - assumed.scatter
+    weak = np.flatnonzero(surely < LEAST_BRAKING)
+    if len(weak):
+        i = int(weak[np.argmin(surely[weak])])
+        among = f" (and {len(weak) - 1} other trains)" if len(weak) > 1 else ""
+        needed = assumed.scatter[i] + LEAST_BRAKING
+        cures = f"brakes that leave {needed:.3g} m/s2 there"
+        if b < needed:
+            cures = f"supervisor.emergency_mps2 of at least {needed:.3g}, and " + cures
+        return [
+            f"supervisor.mode = on: train {p.scenario.ids[i]}{among} cannot be relied on to brake: {_why(p, found, i)}; it takes"
+            f" {cures}"
+        ]
+    rate = p.driving.deceleration_mps2
+    if p.roster is not None and np.any(rate - assumed.scatter < LEAST_BRAKING):
+        i = int(np.argmax(assumed.scatter))
+        return [
+            f"traffic.deceleration_mps2 = {rate:g}: disturbances and faults take {assumed.scatter[i]:.3g} m/s2 of it from train"
+            f" {p.scenario.ids[i]}; at least {assumed.scatter[i] + LEAST_BRAKING:.3g}"
+        ]
+    return []
+
+
+def _why(p: Prepared, found: Parts, i: int) -> str:
+    """What leaves train ``i`` so little braking."""
+    b = p.supervision.emergency_mps2
+    told = [f"full braking {b:g} m/s2"]
+    if found.given[i] < b - 1e-9:
+        faults = " and faults" if p.scenario.fault else ""
+        fall = f" on {1000.0 * found.fall[i] / GRAVITY:.3g} per mil downhill" if found.fall[i] > 0.0 else ""
+        told.append(f"its brakes{faults} leave {found.given[i]:.3g}{fall} up to {found.top[i]:.4g} m/s")
+    for name in ("input", "speed", "resistance", "noise"):
+        share = float(getattr(found, name)[i])
+        if share > 0.0:
+            told.append(f"{_DISTURBED[name]} may take {share:.3g}")
+    return ", ".join(told)
+
+
+#: What of ``Parts`` takes from the braking, in words.
+_DISTURBED = {
+    "input": "disturbances of the input and faulty actuators",
+    "speed": "disturbances of the speed",
+    "resistance": "errors of the running resistance",
+    "noise": "noise",
+}
+
+
+def _lost(p: Prepared) -> list[str]:
+    """Starts from which a collision or an overspeed cannot be averted. Trains that come later enter only where it is safe."""
+    if p.roster is not None:
+        return []
+    rules, speed, step = p.supervision, p.own[p.heads, SPEED], p.scenario.run.step_s
+    places = [p.line.locate(t.track, t.position_m) for t in p.scenario.train]
+    routes = [[p.line.index[e] for e in p.line.route(t.track, t.position_m)] for t in p.scenario.train]
+    laid = ways(routes, p.line.start_m, p.line.length_m)
+    row, n = laid.first[:-1].copy(), len(speed)
+    front = laid.begin[row] + np.array([x for _, x in places])
+    fastest = float(supervisor.stopping_distance(speed, float(p.assumed.braking.min()), step, p.step_theta).max())
+    view = lookout.look(
+        laid, along.net(p.rails), p.rails.speed_mps, np.ones(n), row, front, speed, p.consists.train_length(), np.ones(n, bool),
+        fastest + 1000.0, np.full(n, np.inf), None,
+    )  # fmt: skip
+    found = []
+    late, enough = supervisor.too_late(rules, p.assumed, speed, view.targets, step, p.step_theta)
+    for k in np.flatnonzero(late).tolist():
+        i, j = int(view.targets.train[k]), int(view.targets.other[k])
+        ahead = f"train {p.scenario.ids[j]} ({view.targets.speed[k]:.4g} m/s)" if j >= 0 else "what it must not reach"
+        found.append(
+            f"train[{p.scenario.ids[i]}].speed_mps = {speed[i]:.10g}: {view.targets.room[k]:.6g} m behind {ahead} it cannot be kept"
+            f" apart by {rules.margin_m:g} m, whatever brakes; with braking of {p.assumed.braking[i]:.3g} m/s2 at most"
+            f" {enough[k]:.4g} m/s, or supervisor.mode = off"
+        )
+    limits = view.limits
+    room = np.maximum(limits.distance, 0.0)
+    reached = np.sqrt(np.maximum(speed[limits.train] ** 2 - 2.0 * p.assumed.braking[limits.train] * room, 0.0))
+    for k in np.flatnonzero(reached > limits.speed + 0.1).tolist():
+        i = int(limits.train[k])
+        where = f"in {room[k]:.6g} m" if room[k] > 0.0 else "where it starts"
+        found.append(
+            f"train[{p.scenario.ids[i]}].speed_mps = {speed[i]:.10g}: the line allows {limits.speed[k]:.6g} m/s {where}; even"
+            f" full braking leaves {reached[k]:.4g} m/s"
+        )
+    return found
+
+
+def told(p: Prepared) -> dict[str, Any]:
+    """The promise and what it assumes, in numbers: for `check`, run.json and the report."""
+    rules, found, assumed = p.supervision, parts(p), p.assumed
+    i = int(np.argmin(assumed.braking))
+    counted = {name: float(getattr(found, name).max()) for name in ("input", "speed", "resistance", "noise")}
+    return {
+        "mode": rules.mode,
+        "curve": rules.curve,
+        "full_braking_mps2": rules.emergency_mps2,
+        "relied_on_mps2": float(assumed.braking[i]),
+        "relied_on_of": p.scenario.ids[i],
+        "brakes_and_slope_leave_mps2": float(min(found.given[i], rules.emergency_mps2)),
+        "steepest_descent_permil": float(1000.0 * found.fall.max() / GRAVITY),
+        "hardest_ahead_mps2": float(assumed.hardest.max()),
+        "disturbances_mps2": {name: value for name, value in counted.items() if value > 0.0},
+        "advance_beyond_speed_mps": float(assumed.drift.max()),
+        "actuator_lag_s": float(assumed.lag.max()),
+        "margin_m": rules.margin_m,
+        "position_uncertainty_m": float(assumed.uncertainty.max()),
+        "speed_uncertainty_mps": assumed.blur,
+        "deviations": DEVIATIONS if _unbounded(p) else None,
+        "top_speed_mps": float(found.top.max()),
+    }
+
+
+def _unbounded(p: Prepared) -> bool:
+    """Whether anything random has no bound, so that the promise holds with a probability only."""
+    noisy = p.scenario.plant.kind == "actuated_units" and p.plant_params.noise_variance_m2_per_s6 > 0.0
+    return noisy or any(not np.isfinite(entry.greatest(p.scenario.ids)).all() for entry in p.scenario.disturbance)
+
+
+def sentences(said: dict[str, Any]) -> list[str]:
+    """What ``told`` found, as lines for people."""
+    if said["mode"] == "off":
+        return []
+    lines = [
+        "no law causes a collision, passes a held switch or exceeds the line's limits, as long as:"
+        if said["mode"] == "on"
+        else "monitored only, nothing is prevented; what would be assumed:",
+        f"every train brakes with at least {said['relied_on_mps2']:.4g} m/s2 up to {said['top_speed_mps']:.4g} m/s (least: train"
+        f" {said['relied_on_of']}; ordered {said['full_braking_mps2']:.4g}, brakes and slope leave"
+        f" {said['brakes_and_slope_leave_mps2']:.4g})",
+    ]
+    if said["curve"] == "relative":
+        lines.append(f"a train ahead slows down by at most {said['hardest_ahead_mps2']:.4g} m/s2")
+    else:
+        lines.append("a train ahead may stop dead where its rear is")
+    if said["steepest_descent_permil"]:
+        lines.append(f"descents are no steeper than {said['steepest_descent_permil']:.4g} per mil")
+    for name, value in said["disturbances_mps2"].items():
+        lines.append(f"{_DISTURBED[name]} change an acceleration by at most {value:.4g} m/s2")
+    if said["advance_beyond_speed_mps"]:
+        lines.append(f"a train advances by at most {said['advance_beyond_speed_mps']:.4g} m/s more than its measured speed")
+    if said["actuator_lag_s"]:
+        lines.append(f"actuators lag by at most {said['actuator_lag_s']:.4g} s")
+    measured = (
+        f"positions are measured to {said['position_uncertainty_m']:.4g} m, speeds to {said['speed_uncertainty_mps']:.4g} m/s"
+    )
+    lines.append(f"{measured}; the margin is {said['margin_m']:.4g} m beyond that")
+    if said["deviations"]:
+        lines.append(f"random errors without a bound stay within {said['deviations']:g} standard deviations")
+    return lines
