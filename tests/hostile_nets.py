@@ -21,7 +21,9 @@ def joins_in_a_row(folder: Path, draw: random.Random) -> list[str]:
     joins, x = draw.randint(2, 6), 0.0
     nodes, edges, routes = {"j0": (0.0, 0.0)}, {}, []
     for k in range(1, joins + 2):
-        x += draw.choice([draw.uniform(30.0, 200.0), draw.uniform(200.0, 1500.0), draw.uniform(1500.0, 4000.0)]) if k > 1 else 4000.0
+        x += (
+            draw.choice([draw.uniform(30.0, 200.0), draw.uniform(200.0, 1500.0), draw.uniform(1500.0, 4000.0)]) if k > 1 else 4000.0
+        )
         nodes[f"j{k}"] = (x, 0.0)
         edges[f"m{k}"] = (f"j{k - 1}", f"j{k}", {"speed": speed(draw)})
     x += draw.uniform(2000.0, 8000.0)

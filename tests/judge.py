@@ -155,7 +155,7 @@ def crossed(
 ) -> list[tuple[float, int, int, int, int]]:  # fmt: skip
     """Two trains at once on two tracks that cross."""
     found = []
-    on = [{f: t for f, t in zip(frame[edge == e].tolist(), train[edge == e].tolist(), strict=True)} for e in (a, b)]
+    on = [dict(zip(frame[edge == e].tolist(), train[edge == e].tolist(), strict=True)) for e in (a, b)]
     for f, t in on[0].items():
         other = on[1].get(f, t)
         if other != t:
