@@ -1,0 +1,133 @@
+"""Railways on which protection has a hard time, beside those of ``nets``: each writes ``a.net.xml`` and returns its routes."""
+
+from __future__ import annotations
+
+import random
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import nets
+from nets import both_ways, convert, net
+
+
+def speed(draw: random.Random) -> float:
+    """A limit [m/s]."""
+    return draw.choice([12.0, 20.0, 25.0, 33.0, 40.0, 40.0])
+
+
+def joins_in_a_row(folder: Path, draw: random.Random) -> list[str]:
+    """A main line that branches join one after the other, some within a train's length of each other."""
+    joins, x = draw.randint(2, 6), 0.0
+    nodes, edges, routes = {"j0": (0.0, 0.0)}, {}, []
+    for k in range(1, joins + 2):
+        x += (
+            draw.choice([draw.uniform(30.0, 200.0), draw.uniform(200.0, 1500.0), draw.uniform(1500.0, 4000.0)]) if k > 1 else 4000.0
+        )
+        nodes[f"j{k}"] = (x, 0.0)
+        edges[f"m{k}"] = (f"j{k - 1}", f"j{k}", {"speed": speed(draw)})
+    x += draw.uniform(2000.0, 8000.0)
+    nodes["z"] = (x, 0.0)
+    edges["mz"] = (f"j{joins + 1}", "z", {"speed": speed(draw)})
+    main = [f"m{k}" for k in range(1, joins + 2)] + ["mz"]
+    routes.append(" ".join(main))
+    for k in range(1, joins + 1):
+        away = draw.uniform(1500.0, 5000.0)
+        nodes[f"i{k}"] = (nodes[f"j{k}"][0] - away, draw.choice([-1, 1]) * draw.uniform(200.0, 1500.0))
+        edges[f"in{k}"] = (f"i{k}", f"j{k}", {"speed": speed(draw)})
+        routes.append(" ".join([f"in{k}", *main[k:]]))
+    net(folder, nodes, edges, *draw.choice([(), ("--no-internal-links",)]))
+    return routes
+
+
+def short_edges(folder: Path, draw: random.Random) -> list[str]:
+    """A line cut into pieces of half a metre to fifty, with a join amid them."""
+    nodes, edges, x = {"n0": (0.0, 0.0)}, {}, 3000.0
+    count = draw.randint(8, 30)
+    for k in range(1, count + 1):
+        nodes[f"n{k}"] = (x, 0.0)
+        edges[f"e{k}"] = (f"n{k - 1}", f"n{k}", {"speed": speed(draw) if draw.random() < 0.3 else 40.0})
+        x += draw.choice([draw.uniform(0.5, 5.0), draw.uniform(5.0, 50.0), draw.uniform(5.0, 50.0), draw.uniform(50.0, 900.0)])
+    nodes["z"] = (x + 6000.0, 0.0)
+    edges["z"] = (f"n{count}", "z")
+    at = draw.randint(2, count)
+    nodes["b"] = (nodes[f"n{at}"][0] - 3500.0, 900.0)
+    edges["b"] = ("b", f"n{at}")
+    main = [f"e{k}" for k in range(1, count + 1)] + ["z"]
+    net(folder, nodes, edges, *draw.choice([(), ("--no-internal-links",)]))
+    return [" ".join(main), " ".join(["b", *main[at:]])]
+
+
+def hills(folder: Path, draw: random.Random) -> list[str]:
+    """Two branches over hill and dale, up to 35 per mil, that join and part."""
+    steep = draw.uniform(0.01, 0.035)
+    places = {"w": (0.0, 0.0), "s": (0.0, -1500.0), "1": (4000.0, 0.0), "2": (6500.0, 0.0), "3": (9000.0, 0.0), "4": (11000.0, 0.0),
+              "e": (15000.0, 0.0), "n": (15000.0, 1500.0)}  # fmt: skip
+    height = dict.fromkeys(places, 0.0)
+    for a, b in (("1", "2"), ("2", "3"), ("3", "4"), ("4", "e"), ("4", "n")):
+        run = ((places[b][0] - places[a][0]) ** 2 + (places[b][1] - places[a][1]) ** 2) ** 0.5
+        height[b] = height[a] + run * draw.choice([-1.0, -1.0, 1.0, 0.0]) * draw.uniform(0.5, 1.0) * steep
+    for a in ("w", "s"):
+        height[a] = height["1"] + draw.choice([-1.0, 0.0, 1.0]) * 4000.0 * steep
+    edges = {
+        "west": ("w", "1"), "south": ("s", "1"), "a": ("1", "2", {"speed": speed(draw)}), "b": ("2", "3"),
+        "c": ("3", "4", {"speed": speed(draw)}), "east": ("4", "e"), "north": ("4", "n"),
+    }  # fmt: skip
+    net(folder, places, edges)
+    nodes = folder / "a.nod.xml"
+    nodes.write_text(re.sub(r'id="(\w+)"', lambda m: f'{m[0]} z="{height[m[1]]:.3f}"', nodes.read_text()))
+    convert(folder)
+    return [f"{begin} a b c {end}" for begin in ("west", "south") for end in ("east", "north")]
+
+
+def loops(folder: Path, draw: random.Random) -> list[str]:
+    """Single track with passing loops, both ways."""
+    count = draw.randint(1, 3)
+    nodes, edges, x, up, down = {"n0": (0.0, 0.0)}, {}, 0.0, [], []
+    for k in range(count + 1):
+        x += draw.uniform(1500.0, 4000.0)
+        nodes[f"a{k}"] = (x, 0.0)
+        edges |= both_ways(f"s{k}", "n0" if k == 0 else f"b{k - 1}", f"a{k}", speed=draw.choice([25, 40]))
+        up.append(f"s{k}")
+        down.append(f"-s{k}")
+        if k == count:
+            break
+        long = draw.uniform(600.0, 2500.0)
+        nodes[f"b{k}"] = (x + long, 0.0)
+        for name, ends, side in (("u", (f"a{k}", f"b{k}"), 20), ("d", (f"b{k}", f"a{k}"), -20)):
+            shape = [f"{x},0", f"{x + 200},{side}", f"{x + long - 200},{side}", f"{x + long},0"]
+            edges[f"{name}{k}"] = (*ends, {"shape": " ".join(shape if side > 0 else shape[::-1]), "speed": 25})
+        up.append(f"u{k}")
+        down.append(f"d{k}")
+        x += long
+    net(folder, nodes, edges)
+    return [" ".join(up), " ".join(down[::-1])]
+
+
+def known(build: Callable[..., None], *more: object) -> Callable[[Path, random.Random], list[str]]:
+    """A net of ``nets`` with the routes of its traffic."""
+
+    def lay(folder: Path, draw: random.Random) -> list[str]:
+        build(folder, *more)
+        return sorted(set(re.findall(r'<route edges="([^"]+)"', (folder / "a.rou.xml").read_text())))
+
+    return lay
+
+
+def drawn(folder: Path, draw: random.Random) -> list[str]:
+    """One of ``nets.at_random``."""
+    return known(nets.at_random, draw.randint(0, 10_000))(folder, draw)
+
+
+def single(folder: Path) -> None:
+    """The single track of ``nets``, with trains both ways."""
+    nets.single_track(folder, nets.train("u", nets.UP, 0) + nets.train("d", nets.DOWN, 0))
+
+
+#: How often each railway is laid, of all; those that are drawn are laid in many variants.
+NETS: dict[str, tuple[Callable[[Path, random.Random], list[str]], int]] = {
+    "joins_in_a_row": (joins_in_a_row, 12), "short_edges": (short_edges, 10), "hills": (hills, 8), "loops": (loops, 8),
+    "at_random": (drawn, 8), "branches": (known(nets.branches), 1), "three_joins": (known(nets.three_joins), 1),
+    "single_track": (known(single), 1), "diamond": (known(nets.diamond), 1), "ring": (known(nets.ring), 1),
+    "limits": (known(nets.limits), 1),
+}  # fmt: skip

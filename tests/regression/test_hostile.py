@@ -1,0 +1,137 @@
+"""No law causes a collision where the supervisor is on; without it the same laws collide in most runs.
+
+A case that fails is kept: its folder has the scenario, its line or net and its law, and the message says how to run it.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import time
+import warnings
+from collections import Counter
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import hostile
+import pytest
+
+#: Unsupervised trains run at 1e300 m/s.
+wild = pytest.mark.filterwarnings("ignore::RuntimeWarning")
+
+#: Seeds of the part that always runs.
+ALWAYS, ALWAYS_OFF, ALWAYS_SUMO = range(60), range(24), range(4)
+
+#: Seeds of the campaign. Those of SUMO are others, and as many run with the supervisor off.
+CAMPAIGN, CAMPAIGN_SUMO, CAMPAIGN_OFF = range(10_000, 13_000), range(20_000, 20_200), range(10_000, 10_300)
+
+PROCESSES = 2
+
+
+class Report(NamedTuple):
+    """What became of one run, in what goes from one process to another."""
+
+    seed: int
+    kind: str
+    what: str
+    words: str
+    failures: list[str]
+    folder: str
+    steps: int
+    seconds: float
+
+
+def one(place: Path, plants: hostile.Plants, mode: str, backend: str, seed: int) -> Report:
+    """Draw, run and judge one case."""
+    case = hostile.drawn(seed, place, plants)
+    found = hostile.driven(case, mode, backend)
+    report = Report(
+        seed, case.kind, found.what, found.words, found.failures, str(case.folder), found.steps, found.seconds
+    )  # fmt: skip
+    if not report.failures:
+        hostile.forget(case)
+    return report
+
+
+def told(report: Report, backend: str) -> str:
+    """A failure, and how to see it again."""
+    return (
+        f"seed {report.seed} ({report.kind}): {'; '.join(report.failures)}\n"
+        f"    trainctl run {report.folder}/s.toml --backend {backend} --out {report.folder}/again"
+    )
+
+
+def counted(reports: list[Report]) -> Counter[str]:
+    """How many runs ended how, and in how many there was what."""
+    found = Counter(report.what for report in reports)
+    for report in reports:
+        found.update({failure.partition(":")[0] for failure in report.failures})
+    return found
+
+
+def refusals(reports: list[Report]) -> Counter[str]:
+    """Why runs were refused: the keys that were named."""
+    return Counter(hostile.reason(report.words) for report in reports if report.what == "refused")
+
+
+def harmless(reports: list[Report], backend: str) -> None:
+    """Nothing happened that must not, and not because most was refused."""
+    failed = [told(report, backend) for report in reports if report.failures]
+    assert not failed, f"{len(failed)} of {len(reports)} runs failed\n" + "\n".join(failed[:20])
+    assert counted(reports)["refused"] < 0.25 * len(reports), refusals(reports)
+
+
+def test_no_law_causes_a_collision(tmp_path):
+    harmless([one(tmp_path, hostile.QUICK, "on", "numeric", seed) for seed in ALWAYS], "numeric")
+
+
+def test_in_sumo_neither(tmp_path):
+    harmless([one(tmp_path, hostile.QUICK, "on", "sumo", seed) for seed in ALWAYS_SUMO], "sumo")
+
+
+@wild
+def test_without_the_supervisor_most_runs_collide(tmp_path):
+    reports = [one(tmp_path, hostile.QUICK, "off", "numeric", seed) for seed in ALWAYS_OFF]
+    found = counted(reports)
+    judged = len(reports) - found["refused"]
+    assert found["overlap"] > 0.5 * judged
+    assert sum(bool({"overlap", "overspeed"} & {f.partition(":")[0] for f in r.failures}) for r in reports) > 0.8 * judged
+    assert not [told(r, "numeric") for r in reports if any(f.startswith("silence") for f in r.failures)]
+
+
+def campaign(title: str, seeds: range, place: Path, plants: hostile.Plants, mode: str, backend: str) -> list[Report]:
+    """Run all seeds on some processes, with a line every so often and the figures at the end."""
+    began, reports = time.monotonic(), []
+    strict = partial(warnings.simplefilter, "error" if mode == "on" else "ignore", RuntimeWarning)
+    with multiprocessing.get_context("spawn").Pool(PROCESSES, strict) as pool:
+        for report in pool.imap_unordered(partial(one, place, plants, mode, backend), seeds):
+            reports.append(report)
+            if report.failures and mode == "on":
+                print(told(report, backend), flush=True)
+            if len(reports) % 100 == 0 or len(reports) == len(seeds):
+                took, work = time.monotonic() - began, sum(report.seconds for report in reports)
+                print(
+                    f"{title}: {len(reports)} of {len(seeds)}, {took:.0f} s, {len(reports) / work:.2f} runs per s of a core: ",
+                    end="",
+                )
+                print(dict(counted(reports)), flush=True)
+    print(
+        f"{title}: refused for {dict(refusals(reports))}; died: {dict(Counter(r.words[:60] for r in reports if r.what == 'died'))}"
+    )
+    return sorted(reports)
+
+
+@pytest.mark.campaign
+def test_three_thousand_runs(tmp_path):
+    harmless(campaign("on", CAMPAIGN, tmp_path, hostile.PLANTS, "on", "numeric"), "numeric")
+
+
+@pytest.mark.campaign
+def test_two_hundred_runs_in_sumo(tmp_path):
+    harmless(campaign("SUMO", CAMPAIGN_SUMO, tmp_path, hostile.PLANTS, "on", "sumo"), "sumo")
+
+
+@pytest.mark.campaign
+def test_most_of_them_collide_without(tmp_path):
+    found = counted(campaign("off", CAMPAIGN_OFF, tmp_path, hostile.PLANTS, "off", "numeric"))
+    assert found["overlap"] > 0.5 * (found["done"] + found["died"])
