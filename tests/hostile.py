@@ -24,9 +24,9 @@ from judge import Findings, Recording, judge
 from trainctl import runner
 from trainctl.errors import InputError, TrainctlError
 from trainctl.loop import Simulation
-from trainctl.prepare import Prepared, prepare
-from trainctl.reading import examine
-from trainctl.world import Numeric
+from trainctl.numeric import Numeric
+from trainctl.scenario.build import Prepared, prepare
+from trainctl.scenario.reading import examine
 
 LAWS = Path(__file__).parent / "laws"
 SAMPLED = (

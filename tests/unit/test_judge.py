@@ -8,7 +8,7 @@ import pytest
 import tomli_w
 from judge import Tracks, judge
 
-from trainctl.prepare import open_scenario
+from trainctl.scenario.build import open_scenario
 
 LENGTH = 100.0
 
