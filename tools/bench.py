@@ -124,7 +124,7 @@ PER_PIECE, BRANCH_M, TRUNK_M = 8, 6000.0, 40_000.0
 
 
 def railway(folder: Path, trains: int) -> None:
-    """Pieces of railway beside each other: in each, two branches merge, and trains come on both every 40 s, so that none waits long."""
+    """Pieces of railway beside each other: in each two branches merge; trains come far enough apart to enter at once."""
     from sumo_net.build import program
 
     nodes, edges, came = [], [], []
