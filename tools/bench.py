@@ -74,7 +74,7 @@ WORK = {
 IN_SUMO_WORK = 120_000
 
 #: Steps before those that are measured: until then all trains have come.
-BEFORE = {"traffic": 120}
+BEFORE = {"traffic": 160}
 
 #: Steps of the two runs whose instructions are compared; in between, the recorder writes at 1000 trains what 66 steps hold.
 COUNTED = (10, 76)
@@ -124,7 +124,7 @@ PER_PIECE, BRANCH_M, TRUNK_M = 8, 6000.0, 40_000.0
 
 
 def railway(folder: Path, trains: int) -> None:
-    """Pieces of railway beside each other: in each, two branches merge, and trains come on both every 20 s."""
+    """Pieces of railway beside each other: in each two branches merge; trains come far enough apart to enter at once."""
     from sumo_net.build import program
 
     nodes, edges, came = [], [], []
@@ -136,7 +136,7 @@ def railway(folder: Path, trains: int) -> None:
             edges.append(f'<edge id="{name}{k}" from="{begin}{k}" to="{end}{k}" numLanes="1" speed="40" allow="rail"/>')
     for i in range(trains):
         k, turn = divmod(i, PER_PIECE)
-        branch, depart = ("west", "south")[turn % 2], 20.0 * (turn // 2) + 7.0 * (turn % 2)
+        branch, depart = ("west", "south")[turn % 2], 40.0 * (turn // 2) + 20.0 * (turn % 2)
         came.append((depart, i, f'<route edges="{branch}{k} trunk{k}"/>'))
     body = "".join(f'<vehicle id="{i}" type="emu" depart="{t}" departSpeed="max">{way}</vehicle>' for t, i, way in sorted(came))
     kind = '<vType id="emu" vClass="rail" length="100" maxSpeed="45"/>'
