@@ -10,9 +10,9 @@ import sys
 import tempfile
 from pathlib import Path
 
+from trainctl.diff.runs import EXACT, diff
 from trainctl.prepare import open_scenario
 from trainctl.reading import shipped
-from trainctl.record.diff import EXACT, diff
 from trainctl.record.folder import remove
 from trainctl.runner import run
 from trainctl.testing import make_golden

@@ -10,7 +10,7 @@ import typer
 from trainctl.errors import InputError
 
 if TYPE_CHECKING:
-    from trainctl.record.diff import Report, Tolerances
+    from trainctl.diff.runs import Report, Tolerances
 
 Log = Annotated[
     Path, typer.Argument(help="Run folder, or a log of SUMO's: fcd, tripinfo, summary, statistics, collisions, vehroute.")
@@ -36,7 +36,7 @@ def register(app: typer.Typer) -> None:
         Rows are matched by time and train. Versions are told but are no difference; SUMO's headers, clocks and durations are not
         compared. Without options values may differ by 1e-6, or by one in the last decimal of a log.
         """
-        from trainctl.record.diff import diff as compare
+        from trainctl.diff.runs import diff as compare
 
         report = compare(a, b, _chosen(tolerances, 0.0 if zero else tolerance))
         if as_json:
@@ -50,7 +50,7 @@ def register(app: typer.Typer) -> None:
 
 
 def _chosen(file: Path | None, absolute: float | None) -> Tolerances:
-    from trainctl.record.diff import Tolerance, Tolerances, read_tolerances
+    from trainctl.diff.runs import Tolerance, Tolerances, read_tolerances
 
     read = read_tolerances(file) if file is not None else Tolerances()
     if absolute is None:
@@ -62,7 +62,7 @@ def _chosen(file: Path | None, absolute: float | None) -> Tolerances:
 
 def _show(report: Report) -> None:
     from trainctl.cli import _print, _table
-    from trainctl.record.diff import at, told
+    from trainctl.diff.runs import at, told
 
     for note in report.notes:
         print(f"note: {note}")

@@ -24,9 +24,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from trainctl.diff.runs import THINNED, Report, Tolerances, diff, parse_tolerances, read_tolerances
+from trainctl.diff.sources import sumo_logs_in
 from trainctl.errors import InputError
-from trainctl.record.diff import THINNED, Report, Tolerances, diff, parse_tolerances, read_tolerances
-from trainctl.record.diff_sources import sumo_logs_in
 from trainctl.record.folder import remove, write_info
 from trainctl.record.run import Run
 

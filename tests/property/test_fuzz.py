@@ -29,11 +29,11 @@ from hypothesis import strategies as st
 import sumo_net
 from sumo_net import Line, LineError
 from sumo_net.importing import Options, convert
+from trainctl.diff.runs import diff
 from trainctl.errors import InputError
 from trainctl.facts import facts
 from trainctl.prepare import open_scenario
 from trainctl.reading import read, shipped
-from trainctl.record.diff import diff
 from trainctl.record.metrics import metrics
 from trainctl.record.run import Run
 from trainctl.record.traffic import metrics_of_fcd
@@ -372,7 +372,7 @@ def sumo(finished, tmp_path_factory):
     """Logs of SUMO's in all formats, a net, and the tables of a run."""
     run = finished("three_tracks", "sumo", **{"run.duration_s": 40})
     place = tmp_path_factory.mktemp("logs")
-    from trainctl.record.diff_sources import sumo_log
+    from trainctl.diff.sources import sumo_log
 
     (table,) = [pa.concat_tables(sumo_log(run.folder / "sumo" / "fcd.parquet").batches())]
     lines = ["<fcd-export>"]

@@ -13,9 +13,9 @@ import pytest
 import tomli_w
 from sumo import SUMO_HOME
 
+from trainctl.diff.runs import EXACT, diff
 from trainctl.errors import InputError
 from trainctl.prepare import open_scenario
-from trainctl.record.diff import EXACT, diff
 from trainctl.record.run import Run
 from trainctl.runner import run
 

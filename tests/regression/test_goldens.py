@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from trainctl.diff.runs import read_tolerances
 from trainctl.prepare import open_scenario
 from trainctl.reading import shipped
-from trainctl.record.diff import read_tolerances
 from trainctl.testing import assert_run_matches
 
 GOLDENS = Path(__file__).parent / "goldens"

@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 import tomli_w
 
+from trainctl.diff.runs import EXACT, diff
 from trainctl.prepare import open_scenario
-from trainctl.record.diff import EXACT, diff
 from trainctl.runner import run
 from trainctl.sumo.session import Sumo
 

@@ -16,11 +16,11 @@ import pyarrow.parquet as pq
 import pytest
 import tomli_w
 
+from trainctl.diff.rows import compare
+from trainctl.diff.runs import EXACT, Tolerance, Tolerances, diff, parse_tolerances, read_tolerances
+from trainctl.diff.sources import Log
 from trainctl.errors import InputError
 from trainctl.reading import read
-from trainctl.record.diff import EXACT, Tolerance, Tolerances, diff, parse_tolerances, read_tolerances
-from trainctl.record.diff_rows import compare
-from trainctl.record.diff_sources import Log
 
 LOSS = ("fully_distributed_loss", "numeric")
 SHORT = {"run.duration_s": 60}
@@ -181,7 +181,7 @@ def logs(tmp_path):
             body = text.encode()
         else:
             (tmp_path / "tmp.xml").write_text(text)
-            from trainctl.record.diff_sources import sumo_log
+            from trainctl.diff.sources import sumo_log
 
             table = pa.concat_tables(sumo_log(tmp_path / "tmp.xml").batches())
             names = {"time": "timestep_time", **{n: f"vehicle_{n}" for n in ("id", "speed", "pos", "lane")}}

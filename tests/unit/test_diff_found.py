@@ -11,9 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from sumo_net import Line, LineError
+from trainctl.diff.runs import diff
 from trainctl.errors import InputError
 from trainctl.prepare import open_scenario
-from trainctl.record.diff import diff
 from trainctl.record.metrics import metrics
 from trainctl.record.run import Run
 from trainctl.record.traffic import metrics_of_fcd

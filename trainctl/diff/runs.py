@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from trainctl.diff.rows import Place, TableDiff, compare
+from trainctl.diff.sources import KINDS, our_events, our_table, sumo_log, sumo_logs_in
+from trainctl.diff.tolerance import EXACT, Tolerance, Tolerances, parse_tolerances, read_tolerances
 from trainctl.errors import InputError
-from trainctl.record.diff_rows import Place, TableDiff, compare
-from trainctl.record.diff_sources import KINDS, our_events, our_table, sumo_log, sumo_logs_in
-from trainctl.record.diff_tolerance import EXACT, Tolerance, Tolerances, parse_tolerances, read_tolerances
 from trainctl.record.folder import INFO, plain
 from trainctl.record.run import Run
 

@@ -11,9 +11,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from trainctl.diff.sources import NAMES, Log
+from trainctl.diff.tolerance import CLOCKS, Tolerance, Tolerances
 from trainctl.errors import InputError
-from trainctl.record.diff_sources import NAMES, Log
-from trainctl.record.diff_tolerance import CLOCKS, Tolerance, Tolerances
 from trainctl.signals import Bools, Floats, Ints
 
 #: Rows of one instant, or of a log without times, may not need more than this [bytes].
