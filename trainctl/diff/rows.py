@@ -71,6 +71,8 @@ class TableDiff:
     #: For a closer look: figures by column and train, rows by train that only one log has, the rows themselves.
     trains: list[str] = field(default_factory=list)
     tallies: dict[str, Tally] = field(default_factory=dict)
+    all_a: Presence = field(default_factory=Presence)
+    all_b: Presence = field(default_factory=Presence)
     only_a: Presence = field(default_factory=Presence)
     only_b: Presence = field(default_factory=Presence)
     rows_a: Evidence = field(default_factory=Evidence)
@@ -212,6 +214,8 @@ class _Comparison:
             if self.in_time is not None or not self.found_renamed(ta, time_a, only_a, tb, time_b, only_b):
                 break
         train_a, train_b = columns[0][:split], columns[0][split:]
+        self.out.all_a.add(train_a, time_a / 1e6)
+        self.out.all_b.add(train_b, time_b / 1e6)
         if self.in_time is not None:
             curves = self.curves(columns)
             piece_a, piece_b = Piece(ta, time_a, train_a, curves[:split]), Piece(tb, time_b, train_b, curves[split:])

@@ -11,9 +11,12 @@ import dataclasses
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from trainctl.diff.causes import causes
+from trainctl.diff.findings import Finding, merged
 from trainctl.diff.rows import Place, TableDiff, compare
 from trainctl.diff.sources import KINDS, our_events, our_table, sumo_log, sumo_logs_in
 from trainctl.diff.tolerance import EXACT, Tolerance, Tolerances, parse_tolerances, read_tolerances
@@ -39,11 +42,20 @@ class Report:
     renamed: dict[str, str] = field(default_factory=dict)  # name in A -> name in B
     files: list[str] = field(default_factory=list)  # logs that only one has
     notes: list[str] = field(default_factory=list)  # what is not a difference
+    tolerances: Tolerances = field(default_factory=Tolerances)
 
     @property
     def same(self) -> bool:
         """Whether nothing differs beyond the tolerances."""
         return not (self.settings or self.renamed or self.files) and all(t.same for t in self.tables)
+
+    @cached_property
+    def findings(self) -> list[Finding]:
+        """The differences by train and cause, in the order of time."""
+        out = [Finding("setting", f"{key}: {x} -> {y}") for key, x, y in self.settings]
+        out += [Finding("file", f"log {text}", tables=[text.partition(":")[0]]) for text in self.files]
+        out += [Finding("renamed", f"train {old} is called {new}", [old, new]) for old, new in self.renamed.items()]
+        return merged([*out, *(f for t in self.tables for f in causes(t, self.tolerances))])
 
     @property
     def first(self) -> str | None:
@@ -61,7 +73,7 @@ class Report:
         return {
             "same": self.same, "a": self.a, "b": self.b, "first": self.first, "renamed": self.renamed, "files": self.files,
             "settings": [{"key": key, "a": x, "b": y} for key, x, y in self.settings], "notes": self.notes,
-            "tables": [_table(t) for t in self.tables],
+            "findings": [plain(f.as_dict()) for f in self.findings], "tables": [_table(t) for t in self.tables],
         }  # fmt: skip
 
     def lines(self, most: int = 20) -> list[str]:
@@ -121,7 +133,7 @@ def diff(a: Path | str, b: Path | str, tolerances: Tolerances | None = None) -> 
     a, b : Path
         The reference, and what is compared with it.
     tolerances : Tolerances, optional
-        Default: 1e-6 absolute, 1e-9 relative, wider for forces and energies, and never finer than the decimals of a log.
+        Default: 1e-6 absolute, 2e-9 relative, wider for forces and energies, and never finer than the decimals of a log.
 
     Raises
     ------
@@ -132,7 +144,7 @@ def diff(a: Path | str, b: Path | str, tolerances: Tolerances | None = None) -> 
     for path in (a, b):
         if not path.exists():
             raise InputError(f"{path}: no such file or directory")
-    report = Report(str(a), str(b))
+    report = Report(str(a), str(b), tolerances=chosen)
     names: dict[str, str] = {}  # in B -> in A
     if a.is_dir() != b.is_dir():
         raise InputError(f"{a}, {b}: one is a folder, the other a file: give two run folders or two logs")

@@ -145,17 +145,17 @@ class Evidence:
         return pa.concat_tables(self.tables, promote_options="permissive"), np.concatenate(self.times), np.concatenate(self.trains)
 
 
-#: Rows that only one log has: how many of each train, the first and the last, and how many of them are doubles of another row.
+#: Rows of a train: how many, the first and the last, and how many of them are doubles of another row.
 PRESENCE = {"count": 0.0, "first_s": np.inf, "last_s": -np.inf, "doubled": 0.0}
 
 
 @dataclass
 class Presence:
-    """Rows of each train that only one log has, by number of the train."""
+    """Some rows of each train, by number of the train: all in one log, or those that only one log has."""
 
     figures: dict[str, Floats] = field(default_factory=lambda: {name: np.empty(0) for name in PRESENCE})
 
-    def add(self, train: Ints, time: Floats, doubled: Bools) -> None:
+    def add(self, train: Ints, time: Floats, doubled: Bools | None = None) -> None:
         """Enter rows."""
         if not len(train):
             return
@@ -164,7 +164,8 @@ class Presence:
             room = max(more, len(self.figures["count"]))
             self.figures = {n: np.concatenate([old, np.full(room, PRESENCE[n])]) for n, old in self.figures.items()}
         np.add.at(self.figures["count"], train, 1.0)
-        np.add.at(self.figures["doubled"], train, doubled.astype(float))
+        if doubled is not None:
+            np.add.at(self.figures["doubled"], train, doubled.astype(float))
         np.minimum.at(self.figures["first_s"], train, time)
         np.maximum.at(self.figures["last_s"], train, time)
 

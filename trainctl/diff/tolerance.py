@@ -54,8 +54,8 @@ class Tolerance(NamedTuple):
         return " or ".join(value) + (f", within {' or '.join(time)}" if time else "")
 
 
-#: Positions come back from the simulator exact to 3e-10 m; what two builds of a library may change is below this.
-DEFAULT = Tolerance(1e-6, 1e-9)
+#: Positions come back from the simulator exact to 3e-10 m; what two builds of a library may change is below this: 1e-9 in each.
+DEFAULT = Tolerance(1e-6, 2e-9)
 
 #: ending of a column of ours -> tolerance: forces and energies are large numbers
 ENDINGS = {"_n": Tolerance(1e-3, 1e-9), "_j": Tolerance(1.0, 1e-6)}
