@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from trainctl import cli_diff, cli_extend, cli_import, cli_report, cli_resume, cli_sweep
+from trainctl import cli_diff, cli_extend, cli_golden, cli_import, cli_report, cli_resume, cli_sweep
 from trainctl.errors import InputError, TrainctlError
 
 if TYPE_CHECKING:
@@ -387,6 +387,7 @@ def _options(
 
 cli_diff.register(app)
 cli_extend.register(app)
+cli_golden.register(app)
 cli_import.register(net)
 cli_report.register(app)
 cli_resume.register(app)

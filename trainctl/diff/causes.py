@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from trainctl.diff.closer import Course, Kept, Shift, alike, shifted, stood, way
+from trainctl.diff.closer import PLACES, Course, Kept, Shift, alike, shifted, stood, way
 from trainctl.diff.findings import UNITS, Difference, Finding, named, scaled, seconds, since
 from trainctl.diff.rows import Place, TableDiff
 from trainctl.diff.tolerance import Tolerance, Tolerances
+from trainctl.signals import Bools, Floats
 
 #: So many trains, those that differ first, are looked at one by one.
 CLOSER = 200
@@ -43,8 +44,10 @@ class _Open:
         return out
 
     def first_s(self, train: int) -> float:
-        """When a train differs first, infinite if it does not."""
-        times = [float(self.t.tallies[c].figures["first_s"][train]) for c in self.columns.get(train, ())]
+        """When a train differs first, infinite if it does not; where it is counts more than what else is said of it."""
+        own = self.columns.get(train, set())
+        places = own & {*PLACES, "lane", "edge", "track"}
+        times = [float(self.t.tallies[c].figures["first_s"][train]) for c in places or own]
         times += [self.t.only_a.of("first_s", train)] if train in self.only_a else []
         times += [self.t.only_b.of("first_s", train)] if train in self.only_b else []
         return min(times, default=math.inf)
@@ -105,7 +108,7 @@ def causes(t: TableDiff, tolerances: Tolerances) -> list[Finding]:
     todo, out = _Open.of(t), []
     told = {name: tolerances.of(t.table, name) for name in {*t.compared, *t.tallies}}
     for name in sorted(t.tallies):
-        found = _constant(todo, name, [k for k in todo.columns if name in todo.columns[k]])
+        found = _constant(todo, name)
         out += [found] if found else []
     kept = Kept.of(t.rows_a, t.rows_b, t.keys, t.time)
     out += _ends(todo)
@@ -132,32 +135,52 @@ def _key(t: TableDiff) -> str:
     return t.keys[0] if t.keys else ""
 
 
-def _constant(todo: _Open, name: str, trains: list[int], few: bool = False) -> Finding | None:
-    """A whole column that is the reference's plus or times a constant."""
+def _constant(todo: _Open, name: str, most: bool = True) -> Finding | None:
+    """A column that is the reference's plus or times a constant: of all trains, of most, or (``most`` not asked for) of some.
+
+    Whether it is plus or times is decided by how many trains agree: a train that never changes its speed fits both.
+    """
     t, tally = todo.t, todo.t.tallies[name]
-    if not tally.numbers or not trains:
+    trains = np.array([k for k, columns in sorted(todo.columns.items()) if name in columns], np.int64)
+    if not tally.numbers or not len(trains):
         return None
     f = {key: values[trains] for key, values in tally.figures.items()}
-    if f["count"].sum() < BELIEVED:
+    enough = f["count"] >= (BELIEVED if len(trains) < BELIEVED else 1)
+    low, high = f["shift_low"], f["shift_high"]
+    plus = _agreed(low, high, enough & (low <= high) & (f["count"] == f["rows"]) & (low * high > 0))
+    low, high = f["scale_low"], f["scale_high"]
+    with np.errstate(invalid="ignore"):
+        narrow = np.isfinite(low) & np.isfinite(high) & (high - low < 1e-2 * np.abs(low + high)) & ~((low <= 1.0) & (high >= 1.0))
+        times = _agreed(low, high, enough & (low <= high) & (narrow | ~np.isfinite(low + high)))
+    cause, agreed = ("shift", plus) if plus.sum() >= times.sum() else ("units", times)
+    count = int(agreed.sum())
+    if not count or (most and count < len(trains) and (count < 2 or 2 * count <= len(trains))):
         return None
-    first = float(f["first_s"].min()) if t.time is not None else None
-    every = len(trains) == max(len(t.all_a.trains()), 1)
-    who = "" if every or not t.keys else f" of {named((t.trains[k] for k in trains), _key(t))}"
-    low, high = float(f["shift_low"].max()), float(f["shift_high"].min())
-    if low <= high and np.array_equal(f["count"], f["rows"]) and low * high > 0:
-        c = _neat(low, high)
-        return todo.close("shift", f"{name}{who} shifted by {c:+.6g}{since(first)}", trains, {name}, False, from_s=first, by=c)
-    low, high = float(f["scale_low"].max()), float(f["scale_high"].min())
-    if (
-        low <= high
-        and math.isfinite(low)
-        and math.isfinite(high)
-        and not low <= 1.0 <= high
-        and high - low < 1e-2 * abs(low + high)
-    ):
-        k = next((factor for factor in UNITS if low <= factor <= high), _neat(low, high))
-        return todo.close("units", f"{name}{who} {scaled(k)}{since(first)}", trains, {name}, False, from_s=first, by=k)
-    return None
+    own = [int(k) for k in trains[agreed]]
+    first = float(f["first_s"][agreed].min()) if t.time is not None else None
+    every = count == len(np.intersect1d(t.all_a.trains(), t.all_b.trains()))
+    who = "" if every or not t.keys else f" of {named((t.trains[k] for k in own), _key(t))}"
+    side = "shift" if cause == "shift" else "scale"
+    low_, high_ = float(f[f"{side}_low"][agreed].max()), float(f[f"{side}_high"][agreed].min())
+    if not math.isfinite(low_ + high_):
+        return None
+    if cause == "shift":
+        by = _neat(low_, high_)
+        words = f"{name}{who} shifted by {by:+.6g}{since(first)}"
+    else:
+        by = next((factor for factor in UNITS if low_ <= factor <= high_), _neat(low_, high_))
+        words = f"{name}{who} {scaled(by)}{since(first)}"
+    return todo.close(cause, words, own, {name}, False, from_s=first, by=by)
+
+
+def _agreed(low: Floats, high: Floats, possible: Bools) -> Bools:
+    """The largest set of trains whose intervals have a constant in common."""
+    ends = np.unique(low[possible & np.isfinite(low)])[:CLOSER]
+    best = np.zeros(len(low), np.bool_)
+    for end in ends:
+        inside = possible & (low <= end) & (end <= high)
+        best = inside if inside.sum() > best.sum() else best
+    return best
 
 
 def _neat(low: float, high: float) -> float:
@@ -423,14 +446,10 @@ def _rows(todo: _Open) -> list[Finding]:
 def _of_column(todo: _Open, name: str) -> list[Finding]:
     """What is left of a column: trains shifted or in other units by themselves, and the rest as one finding."""
     t, out = todo.t, []
+    for _ in range(2):
+        found = _constant(todo, name, most=False)
+        out += [found] if found is not None else []
     trains = [k for k, columns in sorted(todo.columns.items()) if name in columns]
-    whole = _constant(todo, name, trains) if trains else None
-    if whole is not None:
-        return [whole]
-    alone = [[k] for k in trains if _constant_of(todo, name, k)]
-    if len(alone) <= 2:
-        out += [f for group in alone if (f := _constant(todo, name, group)) is not None]
-    trains = [k for k in trains if name in todo.columns[k]]
     if not trains:
         return out
     f = todo.close("values", "", trains, {name}, False)
@@ -447,8 +466,3 @@ def _of_column(todo: _Open, name: str) -> list[Finding]:
             f.cause, amount = "noise", f"scatters within {most:.3g}"
     f.words = f"{name} {amount}{f' of {who}' if who else ''}{since(f.from_s)}"
     return [*out, f]
-
-
-def _constant_of(todo: _Open, name: str, train: int) -> bool:
-    f = todo.t.tallies[name].figures
-    return todo.t.tallies[name].numbers and float(f["shift_low"][train]) <= float(f["shift_high"][train])

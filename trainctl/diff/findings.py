@@ -43,7 +43,7 @@ UNITS = {
     3.6: "m/s -> km/h", 1 / 3.6: "km/h -> m/s", 1000.0: "km -> m, s -> ms", 0.001: "m -> km, ms -> s",
     2.2369362920544: "m/s -> mph", 0.44704: "mph -> m/s", 57.29577951308232: "rad -> deg", 0.017453292519943295: "deg -> rad",
     60.0: "min -> s", 1 / 60: "s -> min", 3600.0: "h -> s", 1 / 3600: "s -> h", 100.0: "1 -> %", 0.01: "% -> 1",
-    -1.0: "the sign is turned", 9.80665: "g -> m/s2",
+    -1.0: "the sign is the other one", 9.80665: "g -> m/s2",
     0.3048: "ft -> m", 3.280839895: "m -> ft",
 }  # fmt: skip
 
@@ -91,7 +91,7 @@ class Finding:
     def where(self) -> str:
         """The tables and how much they hold of it, in words."""
         parts = [", ".join(self.tables)]
-        parts += [f"{self.values} values"] * (self.values > 0) + [f"{self.rows} rows"] * (self.rows > 0)
+        parts += [_number(self.values, "value")] * (self.values > 0) + [_number(self.rows, "row")] * (self.rows > 0)
         return ": ".join(parts[:1]) + (f" ({', '.join(parts[1:])})" if parts[1:] else "")
 
 
@@ -107,6 +107,10 @@ def named(trains: Iterable[str], key: str = "train") -> str:
     )
 
 
+def _number(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
 def seconds(value: float) -> str:
     """A time or a difference of times in words."""
     return f"{value:.10g} s" if abs(value) >= 1e-3 else f"{value:.3g} s"
@@ -119,7 +123,7 @@ def since(time_s: float | None) -> str:
 
 def scaled(k: float) -> str:
     """A constant between units in words."""
-    known = next((f", as {words}" for factor, words in UNITS.items() if abs(k / factor - 1) < 2e-3), "")
+    known = next((f": {words}" for factor, words in UNITS.items() if abs(k / factor - 1) < 2e-3), "")
     return f"times {k:.6g}{known}"
 
 
