@@ -197,6 +197,16 @@ def test_a_train_that_is_late_in_two_logs_is_one_finding():
     assert f.first.place.time_s == pytest.approx(60.0, abs=1.0)
 
 
+def test_other_routes_of_several_trains():
+    from trainctl.diff.causes import causes
+
+    how = {"name": "vehroute", "time": None}
+    a = pd.DataFrame({"id": list("pqr"), "depart": [0.0, 1.0, 2.0], "route_edges": ["a b c", "a b d", "a b e"]})
+    b = a.assign(route_edges=["a b c", "a x d", "a b f e"])
+    told = [f.words for f in causes(compare(log(a, **how), log(b, **how), Tolerances(), {}), Tolerances())]
+    assert told == ["train q takes another way: x d instead of b d", "train r takes another way: f e instead of e"]
+
+
 def test_noise_is_called_noise():
     a = course("p", ["a"], n=400)
     b = a.assign(distance=a.distance + np.random.default_rng(0).uniform(-0.05, 0.05, len(a)))

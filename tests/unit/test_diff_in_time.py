@@ -75,7 +75,8 @@ def test_a_train_may_be_late_by_what_is_allowed(late, same):
 def test_a_name_may_come_late_too():
     told = parse_tolerances({"time_s": 2.0})
     assert compare(log(ramp(lanes=True)), log(ramp(2.0, lanes=True)), told, {}).same
-    assert "lane" in compare(log(ramp(lanes=True)), log(ramp(4.0, lanes=True)), told, {}).columns
+    found = compare(log(ramp(lanes=True)), log(ramp(4.0, lanes=True)), told, {}).columns["lane"]
+    assert (found.first.time_s, found.first.a, found.first.b) == (13.0, "e1", "e0")
 
 
 def test_the_tube_is_told():

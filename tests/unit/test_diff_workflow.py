@@ -114,6 +114,15 @@ def test_json_has_the_findings(report):
     assert late["values"] > 1000
 
 
+def test_a_date_in_a_scenario_is_text(finished, tmp_path):
+    run = finished("three_tracks", "numeric", **{"run.duration_s": 40}).folder
+    copy = Path(shutil.copytree(run, tmp_path / "copy"))
+    text = (copy / "scenario.toml").read_text()
+    (copy / "scenario.toml").write_text(text.replace("duration_s = 40.0", "duration_s = 2020-01-01"))
+    found = diff(run, copy).as_dict()
+    assert json.loads(json.dumps(found))["settings"] == [{"key": "scenario.run.duration_s", "a": 40.0, "b": "2020-01-01"}]
+
+
 def test_the_page_stands_alone(report):
     text = page(report)
     assert len(text) < 1_000_000

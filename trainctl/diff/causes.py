@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,6 +16,8 @@ from trainctl.signals import Bools, Floats
 
 #: So many trains, those that differ first, are looked at one by one.
 CLOSER = 200
+#: More trains than this that begin to differ at one instant have not been exchanged.
+EXCHANGED = 20
 #: A constant needs so many values to be believed.
 BELIEVED = 3
 #: What scatters by more than this share of a column's values is no noise.
@@ -309,6 +312,8 @@ def _exchanged(todo: _Open, kept: Kept, trains: list[int], told: dict[str, Toler
     """Pairs of trains each of which goes on as the other does in the reference: they came to a switch in another order."""
     t, out = todo.t, []
     begins = {k: todo.first_s(k) for k in trains}
+    at_once = Counter(begins.values())
+    begins = {k: time if at_once[time] <= EXCHANGED else math.inf for k, time in begins.items()}
     for k, one in enumerate(trains):
         for two in trains[k + 1 :]:
             at = begins[one]

@@ -17,7 +17,6 @@ import numpy as np
 import pyarrow as pa
 
 from trainctl.diff.columns import Compared, floats, resolution, widened
-from trainctl.diff.feed import repeats
 from trainctl.diff.sources import NAMES, Log
 from trainctl.diff.tolerance import CLOCKS, Tolerance, Tolerances
 from trainctl.diff.tube import GAP_S, half_widths, judged, met, number_between
@@ -71,9 +70,14 @@ class Piece(NamedTuple):
 
     def again(self) -> Ints:
         """How many rows of the same curve and time stand before each row."""
-        if not len(self.time):
-            return self.time
-        return repeats(np.unique(np.stack([self.curve, self.time]), axis=1, return_inverse=True)[1])
+        order = np.lexsort((self.time, self.curve))
+        curve, time, count = self.curve[order], self.time[order], np.arange(len(order))
+        same = np.zeros(len(order), np.bool_)
+        same[1:] = (curve[1:] == curve[:-1]) & (time[1:] == time[:-1])
+        out = np.zeros(len(order), np.int64)
+        if same.any():
+            out[order] = count - np.maximum.accumulate(np.where(same, 0, count))
+        return out
 
     def and_(self, other: Piece) -> Piece:
         """Rows of both, in order of curve and time."""
@@ -99,6 +103,9 @@ class Values(NamedTuple):
     found: Compared
     piece: Piece
     cut: tuple[Floats, Floats] | None
+    #: Texts of both logs: those that the reference holds at the time.
+    a: pa.ChunkedArray | None = None
+    b: pa.ChunkedArray | None = None
 
 
 @dataclass
@@ -217,7 +224,10 @@ class InTime:
                 both = pa.chunked_array([c.cast(pa.string()) for c in (*ours.chunks, *theirs.chunks)], pa.string()).combine_chunks()
                 code = both.fill_null("").dictionary_encode().indices.to_numpy(zero_copy_only=False).astype(np.int64)
                 good = met(*one, time, code[: len(time)], w, piece.curve, when, code[len(time) :])
-                out.append(Values(name, tolerance, Compared(~good), piece, None))
+                before = number_between(*one, time, piece.curve, np.full(len(when), -np.inf), when)
+                held = ours.take(pa.array(one[0][piece.curve] + np.maximum(before - 1, 0)))
+                pair = (theirs, held) if self.swapped else (held, theirs)
+                out.append(Values(name, tolerance, Compared(~good), piece, None, *pair))
                 continue
             wide = widened(tolerance, ours, theirs)
             h = half_widths(wide.absolute, wide.relative, wide.range, y, self.spans.of_column(name))

@@ -18,6 +18,8 @@ from trainctl.diff.tally import Evidence, Presence, Tally
 from trainctl.diff.tolerance import CLOCKS, Tolerance, Tolerances
 from trainctl.signals import Bools, Floats, Ints
 
+#: Of so many trains the first texts that differ are kept.
+NAMED_TEXTS = 1000
 #: So many new names of one instant are tried for being an old one's.
 CANDIDATES = 100
 
@@ -355,8 +357,11 @@ class _Comparison:
         first = int(np.argmax(bad))
         if entry.first is None or (entry.first.time_s is not None and entry.first.time_s > times[first] / 1e6):
             entry.first = place(first)
-        for row in np.flatnonzero(bad)[:1] if difference is None else ():
-            tally.texts.setdefault(int(train[row]), (None if a is None else a[int(row)].as_py(), b[int(row)].as_py()))
+        if difference is None:
+            for who, row in zip(*np.unique(train[bad], return_index=True), strict=True):
+                if int(who) not in tally.texts and len(tally.texts) < NAMED_TEXTS:
+                    at = int(np.flatnonzero(bad)[row])
+                    tally.texts[int(who)] = (None if a is None else a[at].as_py(), b[at].as_py())
         if difference is not None:
             worst = int(np.argmax(np.where(bad, difference, -1.0)))
             if entry.largest is None or not entry.largest.difference or difference[worst] > entry.largest.difference:
@@ -376,9 +381,9 @@ class _Comparison:
         for v in judged.values:
             if v.column not in CLOCKS.get(self.out.table, ()):
                 self.out.compared.add(v.column)
-            self.enter(
-                v.column, v.tolerance, v.found, v.piece.time, v.piece.train, v.piece.table, None, v.piece.table[v.column], v.cut
-            )
+            piece = v.piece
+            b = v.piece.table[v.column] if v.b is None else v.b
+            self.enter(v.column, v.tolerance, v.found, piece.time, piece.train, piece.table, v.a, b, v.cut)
 
     def but_names(self, bad: Bools, a: pa.ChunkedArray, b: pa.ChunkedArray) -> Bools:
         """Texts that differ in the name of a renamed train alone do not differ."""

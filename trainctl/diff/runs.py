@@ -70,7 +70,7 @@ class Report:
         """Everything in what JSON knows."""
         return {
             "same": self.same, "a": self.a, "b": self.b, "first": self.first, "renamed": self.renamed, "files": self.files,
-            "settings": [{"key": key, "a": x, "b": y} for key, x, y in self.settings], "notes": self.notes,
+            "settings": [{"key": key, "a": _json(x), "b": _json(y)} for key, x, y in self.settings], "notes": self.notes,
             "findings": [plain(f.as_dict()) for f in self.findings], "tables": [_table(t) for t in self.tables],
         }  # fmt: skip
 
@@ -108,6 +108,15 @@ def _short(value: float | str | None) -> str:
         return f"{value:.10g}"
     text = "nothing" if value in (None, "") else str(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _json(value: Any) -> Any:
+    """A value of a scenario in what JSON knows: dates, which TOML has, as text."""
+    if isinstance(value, list):
+        return [_json(item) for item in value]
+    if isinstance(value, Mapping):
+        return {str(key): _json(item) for key, item in value.items()}
+    return plain(value) if value is None or isinstance(value, str | bool | int | float) else str(value)
 
 
 def _table(t: TableDiff) -> dict[str, Any]:
