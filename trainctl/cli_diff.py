@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 #: Rows behind a finding that ``--rows`` shows.
 ROWS = 20
 
-Log = Annotated[Path, typer.Argument(help="Run folder, golden, log of SUMO's or folder of these; the first is the reference.")]
+Reference = Annotated[Path, typer.Argument(help="The reference: a run folder, a golden, a log of SUMO's or a folder of these.")]
+Other = Annotated[Path, typer.Argument(help="What is compared with it, of the same kind.")]
 TolerancesFile = Annotated[
     Path | None,
     typer.Option("--tolerances", metavar="FILE", help="TOML: tolerances in value and time, of all and of single columns."),
@@ -37,8 +38,8 @@ def register(app: typer.Typer) -> None:
 
     @app.command()
     def diff(
-        a: Log,
-        b: Log,
+        a: Reference,
+        b: Other,
         tolerances: TolerancesFile = None,
         tolerance: Absolute = None,
         time_tolerance: InTime = None,
@@ -97,7 +98,7 @@ def chosen_tolerances(file: Path | None, absolute: float | None, time_s: float |
     """Tolerances of a file, and what the options say instead."""
     from dataclasses import replace
 
-    from trainctl.diff.tolerance import Tolerance, Tolerances, read_tolerances
+    from trainctl.diff.tolerance import TIMES, Tolerance, Tolerances, read_tolerances
 
     found = read_tolerances(file) if file is not None else Tolerances()
     wrong = [
@@ -108,7 +109,12 @@ def chosen_tolerances(file: Path | None, absolute: float | None, time_s: float |
     if wrong:
         raise InputError(wrong)
     if time_s is not None:
-        found = replace(found, time=Tolerance(0.0, time_s=time_s))
+        old, new = ({name: getattr(time, name) for name in TIMES} for time in (found.time, Tolerance(0.0, time_s=time_s)))
+        # columns with a word of their own on time keep it
+        columns = {
+            name: t._replace(**new) if old == {key: getattr(t, key) for key in TIMES} else t for name, t in found.columns.items()
+        }
+        found = replace(found, time=Tolerance(0.0, time_s=time_s), columns=columns)
     if absolute is not None:
         found = replace(found, everywhere=Tolerance(absolute, stated=True))
     return found

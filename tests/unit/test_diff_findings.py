@@ -46,7 +46,7 @@ def judged(fcd, written, tmp_path, kind, seed):
     return report
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("kind", mutations.MUTATIONS)
 def test_what_was_done_is_named(fcd, written, tmp_path, kind, seed):
     report = judged(fcd, written, tmp_path, kind, seed)
@@ -193,7 +193,7 @@ def test_a_train_that_is_late_in_two_logs_is_one_finding():
     two = compare(log(trips, **how), log(slow, **how), Tolerances(), {})
     (f,) = merged([f for t in (one, two) for f in causes(t, Tolerances())])
     assert (f.cause, f.trains, f.by, f.tables) == ("late", ["p"], 7.0, ["fcd", "tripinfo"])
-    assert f.words == "train p late by 7 s, as it stands on b from 60 s on"[: len(f.words)] or "late by 7 s" in f.words
+    assert f.words == "train p late by 7 s, as it stands on b from 61 s on"
     assert f.first.place.time_s == pytest.approx(60.0, abs=1.0)
 
 

@@ -175,6 +175,17 @@ def test_rows_behind_a_finding(pair, monkeypatch, capsys):
     assert re.search(r"fcd: \d+ s, id fast\.1: x [\d.]+ -> [\d.]+", out)
 
 
+def test_options_say_instead_of_the_file(tmp_path):
+    from trainctl.cli_diff import chosen_tolerances
+
+    (tmp_path / "t.toml").write_text("relative = 0.1\n[columns]\nspeed = 0.5\npos = {absolute = 1.0, time_s = 9.0}\n")
+    told = chosen_tolerances(tmp_path / "t.toml", 0.25, 2.0)
+    assert (told.of("fcd", "x").absolute, told.of("fcd", "x").relative, told.of("fcd", "x").time_s) == (0.25, 0.0, 2.0)
+    assert (told.of("fcd", "speed").absolute, told.of("fcd", "speed").time_s) == (0.5, 2.0)
+    assert (told.of("fcd", "pos").absolute, told.of("fcd", "pos").time_s) == (1.0, 9.0)
+    assert told.time.time_s == 2.0
+
+
 def test_a_tolerance_in_time_lets_a_late_train_pass(typed, finished, tmp_path):
     frame = mutations.read(finished("merging").folder)
     rows = frame[frame.id == "fast.1"]

@@ -24,6 +24,8 @@ PLACES = ("position_m", "distance", "odometer", "x", "y", "pos")
 SPEEDS = ("speed_mps", "speed")
 #: A train slower than this stands [m/s].
 STANDS = 0.1
+#: ... if it is so slow in this share of the rows.
+MOST = 0.6
 #: Rows that must show a shift in time, and the share of the rows after the first difference.
 FEWEST, SHARE = 5, 0.5
 #: Shifts in time that are tried, and values by which they are sought.
@@ -239,7 +241,7 @@ def stood(course: Course, begin: float, end: float) -> bool:
     """Whether a train stands through most of a time."""
     speed = course.speed
     inside = (course.time >= begin) & (course.time <= end)
-    return speed is not None and bool(inside.any()) and float((speed[inside] <= STANDS).mean()) >= 0.8
+    return speed is not None and bool(inside.any()) and float((speed[inside] <= STANDS).mean()) >= MOST
 
 
 def way(course: Course, words: dict[str, list[str]], tracks: bool = False) -> list[tuple[str, float]]:
