@@ -106,8 +106,11 @@ def _difference(t: TableDiff, name: str, train: int, which: str) -> Difference:
 
 def causes(t: TableDiff, tolerances: Tolerances) -> list[Finding]:
     """All findings of one table."""
-    if t.same:
-        return []
+    with np.errstate(over="ignore", invalid="ignore"):  # a damaged log may hold any number
+        return [] if t.same else _causes(t, tolerances)
+
+
+def _causes(t: TableDiff, tolerances: Tolerances) -> list[Finding]:
     todo, out = _Open.of(t), []
     told = {name: tolerances.of(t.table, name) for name in {*t.compared, *t.tallies}}
     for name in sorted(t.tallies):
@@ -150,7 +153,7 @@ def _constant(todo: _Open, name: str, most: bool = True) -> Finding | None:
     f = {key: values[trains] for key, values in tally.figures.items()}
     enough = f["count"] >= (BELIEVED if len(trains) < BELIEVED else 1)
     low, high = f["shift_low"], f["shift_high"]
-    plus = _agreed(low, high, enough & (low <= high) & (f["count"] == f["rows"]) & (low * high > 0))
+    plus = _agreed(low, high, enough & (low <= high) & (f["count"] == f["rows"]) & (np.sign(low) * np.sign(high) > 0))
     low, high = f["scale_low"], f["scale_high"]
     with np.errstate(invalid="ignore"):
         narrow = np.isfinite(low) & np.isfinite(high) & (high - low < 1e-2 * np.abs(low + high)) & ~((low <= 1.0) & (high >= 1.0))

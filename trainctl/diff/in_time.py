@@ -233,7 +233,7 @@ class InTime:
             h = half_widths(wide.absolute, wide.relative, wide.range, y, self.spans.of_column(name))
             good, spare = np.zeros(len(when), np.bool_), np.empty((3, len(when)))
             judged(*one, time, y, w, h, piece.curve, when, value, GAP_S, good, spare[0], spare[1], spare[2])
-            with np.errstate(invalid="ignore"):
+            with np.errstate(over="ignore", invalid="ignore"):
                 gap = np.where(good, 0.0, np.abs(value - spare[0]))
             gap = np.where(np.isfinite(gap), gap, np.inf)
             near_by, b = (value, spare[0]) if self.swapped else (spare[0], value)

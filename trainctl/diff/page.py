@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from html import escape
 from importlib.resources import files
@@ -45,6 +46,11 @@ class Curves(NamedTuple):
 
 def page(report: Report) -> str:
     """The whole page as text."""
+    with np.errstate(over="ignore", invalid="ignore"):  # a damaged log may hold any number
+        return _page(report)
+
+
+def _page(report: Report) -> str:
     plots = [(f, c) for f in report.findings for c in _curves(f, report)][:PLOTS]
     shown: dict[int, list[str]] = {}
     data = []
@@ -191,6 +197,8 @@ def _figure(c: Curves, number: int) -> tuple[str, dict[str, object]]:
     pad = 0.06 * (high - low) or max(1e-9, 0.01 * abs(high), float(wide[np.isfinite(wide)].max(initial=0.0)))
     low, high = low - pad, high + pad
     end = end if end > begin else begin + 1.0
+    if not (math.isfinite(high - low) and high > low and math.isfinite(end - begin)):
+        low, high, begin, end = 0.0, 1.0, 0.0, 1.0  # numbers no picture can show
 
     def x(t: Floats) -> Floats:
         return LEFT + (t - begin) / (end - begin) * (WIDTH - LEFT - RIGHT)

@@ -51,6 +51,10 @@ class Tally:
 
     def add(self, train: Ints, time: Floats, found: Compared, cut: tuple[Floats, Floats] | None = None) -> None:
         """Enter compared rows, ascending in time; ``cut`` are the tube's ends."""
+        with np.errstate(over="ignore", invalid="ignore"):  # a damaged log may hold any number
+            self._add(train, time, found, cut)
+
+    def _add(self, train: Ints, time: Floats, found: Compared, cut: tuple[Floats, Floats] | None) -> None:
         bad = found.bad
         if not bad.any() and not len(self.figures["count"]):
             return
@@ -76,8 +80,7 @@ class Tally:
         f["most_s"][worst], f["most_a"][worst], f["most_b"][worst], f["most_gap"][worst] = time[row], a[row], b[row], gap[row]
         if cut is not None:
             f["low"][worst], f["high"][worst] = cut[0][row], cut[1][row]
-        with np.errstate(invalid="ignore"):
-            signed = np.nan_to_num((b - a)[which], posinf=0.0, neginf=0.0)
+        signed = np.nan_to_num((b - a)[which], posinf=0.0, neginf=0.0)
         np.add.at(f["sum"], who, signed)
         np.add.at(f["sum_abs"], who, np.abs(signed))
         self._constants(train, time, a, b, found.allowed, found.decimal)

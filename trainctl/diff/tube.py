@@ -204,5 +204,6 @@ def inside(time: Floats, y: Floats, w: Floats, h: Floats, at: Floats, value: Flo
 
 def half_widths(absolute: float, relative: float, share: float, values: Floats, span: float) -> Floats:
     """Tolerance of each sample: the widest of absolute, relative to its value, and a share of the range ``span``."""
-    size: Floats = np.maximum(max(absolute, share * span if share else 0.0), relative * np.abs(values))
+    with np.errstate(over="ignore", invalid="ignore"):
+        size: Floats = np.maximum(max(absolute, share * span if share else 0.0), relative * np.abs(values))
     return np.where(np.isfinite(size), size, absolute)
