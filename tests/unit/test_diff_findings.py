@@ -231,9 +231,9 @@ def test_a_train_that_is_missing_and_one_that_is_new():
 
 
 def test_what_differs_by_no_rule_is_no_other_thing():
-    """A train that loses time all the way is not late by what it has lost in the last three rows."""
+    """A train that loses time all the way is not late by what it has lost in the last ten rows."""
     a = course("p", ["a", "b", "c"], n=60).drop(columns="pos")
-    lost = np.where(a.time >= 57, 5.0, 0.021 * a.time)
+    lost = np.where(a.time >= 50, 5.0, 0.021 * a.time)
     assert [f.cause for f in found([a], [a.assign(distance=a.distance - 20.0 * lost)])] == ["values"]
 
 
