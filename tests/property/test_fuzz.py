@@ -17,6 +17,7 @@ import tomllib
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -29,7 +30,10 @@ from hypothesis import strategies as st
 import sumo_net
 from sumo_net import Line, LineError
 from sumo_net.importing import Options, convert
+from trainctl.diff.page import page
+from trainctl.diff.results import junit
 from trainctl.diff.runs import diff
+from trainctl.diff.tolerance import parse_tolerances
 from trainctl.errors import InputError
 from trainctl.metrics.run import metrics
 from trainctl.metrics.traffic import metrics_of_fcd
@@ -284,12 +288,22 @@ def write_mutated(data, file, target):
     pq.write_table(table, target)
 
 
+def compared(a, b):
+    """Compare in both ways, and put the findings into words."""
+    for tolerances in (None, parse_tolerances({"time_s": 1.5, "range": 0.01})):
+        report = diff(a, b, tolerances)
+        json.dumps(report.as_dict())
+        ET.fromstring(junit(report))
+        page(report)
+        assert report.same or report.findings
+
+
 def fuzz_log(data, place, sumo):
     """diff of a log with its mutation; metrics of an FCD log."""
     file = sumo[data.draw(st.sampled_from(sorted(sumo)))]
     target = mutated_log(data, file, place)
     with bounded():
-        diff(file, target)
+        compared(file, target)
     with bounded():
         metrics_of_fcd(target)
 
@@ -317,7 +331,7 @@ def fuzz_run(data, place, sumo):
     else:
         file.write_bytes(data.draw(scarred(file.read_bytes())))
     with bounded():
-        diff(whole, copied)
+        compared(whole, copied)
     with bounded():
         metrics(Run(copied))
 
