@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from trainctl.errors import InputError
+from trainctl.runs.kinds import KINDS
 
 
 class Tolerance(NamedTuple):
@@ -31,6 +32,7 @@ ENDINGS = {"_n": Tolerance(1e-3, 1e-9), "_j": Tolerance(1.0, 1e-6)}
 #: Clocks of the machine, in SUMO's summary and statistics.
 CLOCKS = {
     "summary": {"duration"},
+    "personsummary": {"duration"},
     "statistics": {
         "performance_clockBegin", "performance_clockEnd", "performance_clockDuration", "performance_traciDuration",
         "performance_realTimeFactor", "performance_vehicleUpdatesPerSecond", "performance_personUpdatesPerSecond",
@@ -38,7 +40,7 @@ CLOCKS = {
 }  # fmt: skip
 
 #: Names that may stand before a column.
-TABLES = ("trains", "units", "links", "events", "fcd", "tripinfo", "summary", "statistics", "collisions", "vehroute")
+TABLES = ("trains", "units", "links", "events", *(kind.name for kind in KINDS))
 
 
 @dataclass(frozen=True)
