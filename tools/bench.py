@@ -28,6 +28,8 @@ processor is told too (``cpu_``, all threads): where others use the machine it i
 ``--instructions`` counts instead of measuring: instructions per train and step, by valgrind, which must be installed. They are no
 times (a cache miss is not seen), but the same whatever else the machine does: they tell whether a change made anything cheaper.
 Nothing is closed, and SUMO behind TraCI is not counted.
+
+``--logs`` measures how fast logs are read instead (``tools/bench_logs.py``).
 """
 
 from __future__ import annotations
@@ -571,6 +573,7 @@ def main() -> None:
     parser.add_argument("--only", action="append", choices=[*IN_SUMO, *NUMERIC], help="this case; repeatable; default all")
     parser.add_argument("--repeats", type=int, default=3, help="repeats of each case; the median is told")
     parser.add_argument("--instructions", action="store_true", help="count instructions with valgrind: repeatable, but slow")
+    parser.add_argument("--logs", type=float, nargs="?", const=40.0, metavar="MB", help="how fast logs of this size are read")
     parser.add_argument("--json", action="store_true", help="print a list of rows for machines")
     parser.add_argument("--case", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--inputs", nargs=4, help=argparse.SUPPRESS)
@@ -580,6 +583,12 @@ def main() -> None:
         inputs(Path(folder), case, int(trains), int(steps))
     elif asked.case:
         child(asked.case[0], Path(asked.case[1]))
+    elif asked.logs is not None:
+        import bench_logs
+
+        with tempfile.TemporaryDirectory(prefix="trainctl-bench-") as root:
+            rows = bench_logs.logs(Path(root), asked.logs, asked.repeats)
+        print(json.dumps(rows, indent=2) if asked.json else bench_logs.table(rows))
     else:
         with tempfile.TemporaryDirectory(prefix="trainctl-bench-") as root:
             sizes, cases = asked.trains or list(SIZES), asked.only
