@@ -1,17 +1,18 @@
 """Reading what runs leave behind: logs of SUMO's in any format, and (``trainctl.record``) our own run folders.
 
-One reader serves ``trainctl diff`` and ``trainctl metrics``: ``logs.sumo_log(path)`` says what a file is, ``Log.batches()`` streams it.
+One reader serves ``trainctl diff`` and ``trainctl metrics``: ``logs.sumo_log(path)`` says what a file is, ``Log.batches()``
+streams it.
 
 The table a reader returns
 --------------------------
-``Log.batches()`` yields pyarrow tables, in the order of the file, and begins anew at every call. However a log was written (XML, CSV
-with any separator and any style of header, Parquet; gzipped or not), the same run gives the same rows and columns:
+``Log.batches()`` yields pyarrow tables, in the order of the file, and begins anew at every call. However a log was written
+(XML, CSV with any separator and any style of header, Parquet; gzipped or not), the same run gives the same rows and columns:
 
 rows
-    One per element that stands for something: a vehicle, person or container at an instant (``fcd``, ``emission``), a finished trip
-    (``tripinfo``), a step (``summary``), an edge or lane and interval (``edgedata``, ``lanedata``), a conflict (``ssm``); statistics
-    are a single row. A step without vehicles has no row. CSV and Parquet repeat a row for every element inside it: it is one row
-    here.
+    One per element that stands for something: a vehicle, person or container at an instant (``fcd``, ``emission``), a finished
+    trip (``tripinfo``), a step (``summary``), an edge or lane and interval (``edgedata``, ``lanedata``), a conflict (``ssm``);
+    statistics are a single row. A step without vehicles has no row. CSV and Parquet repeat a row for every element inside it: it
+    is one row here.
 columns
     Named as SUMO's XML names the attribute (``speed``, ``lane``). What stands inside a row carries the name of its element
     (``emissions_CO_abs``); the second such element of a row a number at the end (``stop_lane2``). What stands around a row becomes

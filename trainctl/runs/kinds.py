@@ -85,9 +85,9 @@ STATISTICS = tuple((f"{tag}_{name}", name) for tag, names in _STATISTICS.items()
 
 #: Plain headers of what stands inside a row of trips and routes.
 PLAIN = {
-    "tripinfo": {f"{what}_abs": f"emissions_{what}_abs" for what in "CO CO2 HC PMx NOx fuel electricity".split()},
+    "tripinfo": {f"{what}_abs": f"emissions_{what}_abs" for what in ["CO", "CO2", "HC", "PMx", "NOx", "fuel", "electricity"]},
     "vehroute": {"edges": "route_edges", "exitTimes": "route_exitTimes"},
-    "walks": {name: f"walk_{name}" for name in "edges exitTimes started ended".split()},
+    "walks": {name: f"walk_{name}" for name in ["edges", "exitTimes", "started", "ended"]},
 }
 
 

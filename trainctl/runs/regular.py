@@ -1,9 +1,9 @@
 """Blocks of XML exactly as SUMO writes it: one row a line, the same attributes in the same order, nothing else.
 
 A block is read as CSV whose separator is the quotation mark: texts between two marks are values, and texts outside are literal
-(`` speed=``). It is regular if every literal column has one value only, if no row lies across lines, and if nothing stands in it
-that XML would read in another way: then it is well-formed, and what the strict parser would find is what the columns hold. Any doubt
-makes the block irregular, and the strict parser decides.
+(`` speed=``). It is regular if the rows of one form (one element, one number of attributes) have the same literals, if every line
+holds one element, and if nothing stands in it that XML would read in another way: then it is well-formed, and what the strict
+parser would find is what the columns hold. Any doubt makes the block irregular, and the strict parser decides.
 """
 
 from __future__ import annotations

@@ -153,7 +153,7 @@ class Parser:
             raise InputError(f"{self.path}: line {line}: an element longer than {ELEMENT_BYTES >> 20} MiB")
 
     def between(self) -> bool:
-        """Whether all that was fed is read, and the next byte stands in the root, outside any other element, comment or the like."""
+        """Whether all that was fed is read, and the next byte stands in the root, outside any other element or comment."""
         if self.comments is None or self.comments.open or self.started - self.gone != 1:
             return False
         self._parse(_PROBE, False)  # in a comment, a CDATA section, an instruction it is no element

@@ -134,8 +134,8 @@ class _Gathered:
     def put(self, found: list[Element], gone: int) -> Iterator[pa.Table]:
         """Take elements, when so many have ended before them; yield a table whenever enough rows have come."""
         rows, around, step = frozenset(self.kind.rows), self.kind.around, self.kind.step
-        for self.begun, (tag, attributes, ended) in enumerate(found, self.begun + 1):
-            depth = self.begun - gone - ended
+        for begun, (tag, attributes, ended) in enumerate(found, self.begun + 1):
+            depth = begun - gone - ended
             if self.open is not None and (depth <= self.row_depth or tag in rows):
                 self._close()
                 if self.count >= BATCH_ROWS or self.values > VALUES or len(self.forms) >= FORMS:
@@ -153,6 +153,7 @@ class _Gathered:
                 self._leave(depth + 1)
             elif self.open is not None:
                 self._inner(tag, attributes)
+        self.begun += len(found)
         for form in self.forms.values():
             form.fold()
 
