@@ -170,6 +170,17 @@ def test_plain_statistics_of_an_old_version_are_told_apart_by_their_order(tmp_pa
     assert row.items() <= table.to_pylist()[0].items()
 
 
+def test_rows_of_one_element_are_joined_across_pieces_whatever_their_columns_are_called(tmp_path, monkeypatch):
+    rows = "".join(f"p{k};0;5;{leg}\n" for k in range(3) for leg in (1, 2, 3))
+    (tmp_path / "a.csv").write_text(f"personinfo_id;personinfo_depart;personinfo_duration;ride_pos2\n{rows}")
+    for size in (60, 75, 100, 1 << 20):
+        monkeypatch.setattr("trainctl.runs.tables.BLOCK", size)
+        found = [row for table in sumo_log(tmp_path / "a.csv").batches() for row in table.to_pylist()]
+        assert [[row[name] for name in ("id", "ride_pos2", "ride_pos22", "ride_pos23")] for row in found] == [
+            [f"p{k}", "1", "2", "3"] for k in range(3)
+        ]
+
+
 @pytest.mark.parametrize("name", ["fcd.xml", "fcd.csv"])
 def test_gzipped(written, tmp_path, name):
     source = log_of(written, {"fcd.xml": "xml", "fcd.csv": "tag.csv"}[name], "fcd")

@@ -190,24 +190,30 @@ def _joined(pieces: Iterator[pa.Table], own: list[str]) -> Iterator[pa.Table]:
     for piece in pieces:
         if held is not None:
             piece = pa.concat_tables([held, piece], promote_options="permissive")
-        rows: list[dict[str, Any]] = []
-        last = None
-        for row in piece.to_pylist():
-            mine = [row[name] for name in own]
-            if rows and mine == last and row != rows[-1]:
-                _join(rows[-1], row, own)
-            else:
-                rows.append(row)
-            last = mine
-        if not rows:
-            continue
-        types = {name: piece.schema.field(name).type for name in piece.column_names}
-        whole = _table(rows, types)
-        held = whole.slice(len(rows) - 1)
-        if len(rows) > 1:
-            yield whole.slice(0, len(rows) - 1)
+        name = piece[own[0]]
+        if pc.any(pc.equal(name.slice(1), name.slice(0, max(len(name) - 1, 0)))).as_py() or name.null_count:
+            piece = _one_each(piece, own)
+        if len(piece) > 1:
+            yield piece.slice(0, len(piece) - 1)
+        held = piece.slice(max(len(piece) - 1, 0))
     if held is not None:
         yield held
+
+
+def _one_each(piece: pa.Table, own: list[str]) -> pa.Table:
+    rows: list[dict[str, Any]] = []
+    last = None
+    for row in piece.to_pylist():
+        mine = [row[name] for name in own]
+        if rows and mine == last and row != rows[-1]:
+            _join(rows[-1], row, own)
+        else:
+            rows.append(row)
+        last = mine
+    names = dict.fromkeys(name for row in rows for name in row)
+    types = {name: piece.schema.field(name).type for name in piece.column_names}
+    kinds = {name: next(types[name[:k]] for k in range(len(name), 0, -1) if name[:k] in types) for name in names}  # pos, pos2
+    return pa.table({name: pa.array([row.get(name) for row in rows], kinds[name]) for name in names})
 
 
 def _join(row: dict[str, Any], more: dict[str, Any], own: list[str]) -> None:
@@ -220,9 +226,3 @@ def _join(row: dict[str, Any], more: dict[str, Any], own: list[str]) -> None:
             number += 1
             free = f"{name}{number}"
         row[free] = value
-
-
-def _table(rows: list[dict[str, Any]], types: dict[str, pa.DataType]) -> pa.Table:
-    names = dict.fromkeys(name for row in rows for name in row)
-    kinds = {name: types.get(name) or types[name.rstrip("0123456789")] for name in names}
-    return pa.table({name: pa.array([row.get(name) for row in rows], kinds[name]) for name in names})
