@@ -34,6 +34,8 @@ this checkout over the other, with the least and the greatest. Closing the logs 
 ``--instructions`` counts instead of measuring: instructions per train and step, by valgrind, which must be installed. They are no
 times (a cache miss is not seen), but the same whatever else the machine does: they tell whether a change made anything cheaper.
 Nothing is closed, and SUMO behind TraCI is not counted.
+
+``--logs`` measures how fast logs are read instead (``tools/bench_logs.py``).
 """
 
 from __future__ import annotations
@@ -712,6 +714,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, help="repeats of each case, default 3; of pairs, default 10; the median is told")
     parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="compare with the code there; default 1000 trains")
     parser.add_argument("--instructions", action="store_true", help="count instructions with valgrind: repeatable, but slow")
+    parser.add_argument("--logs", type=float, nargs="?", const=40.0, metavar="MB", help="how fast logs of this size are read")
     parser.add_argument("--json", action="store_true", help="print a list of rows for machines")
     parser.add_argument("--case", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--public", nargs=3, help=argparse.SUPPRESS)
@@ -727,6 +730,12 @@ def main() -> None:
         case, folder, checkout = asked.public
         of_this(Path(checkout))
         child(case, Path(folder), public)
+    elif asked.logs is not None:
+        import bench_logs
+
+        with tempfile.TemporaryDirectory(prefix="trainctl-bench-") as root:
+            rows = bench_logs.logs(Path(root), asked.logs, asked.repeats)
+        print(json.dumps(rows, indent=2) if asked.json else bench_logs.table(rows))
     else:
         with tempfile.TemporaryDirectory(prefix="trainctl-bench-") as root:
             sizes, cases = asked.trains or list(SIZES), asked.only

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from trainctl.errors import InputError
+from trainctl.runs.kinds import KINDS
 
 
 class Tolerance(NamedTuple):
@@ -63,6 +64,7 @@ ENDINGS = {"_n": Tolerance(1e-3, 1e-9), "_j": Tolerance(1.0, 1e-6)}
 #: Clocks of the machine, in SUMO's summary and statistics.
 CLOCKS = {
     "summary": {"duration"},
+    "personsummary": {"duration"},
     "statistics": {
         "performance_clockBegin", "performance_clockEnd", "performance_clockDuration", "performance_traciDuration",
         "performance_realTimeFactor", "performance_vehicleUpdatesPerSecond", "performance_personUpdatesPerSecond",
@@ -78,7 +80,7 @@ MOST_OF_THE_CLOCK = 0.5
 NO_TIME = Tolerance(0.0)
 
 #: Names that may stand before a column.
-TABLES = ("trains", "units", "links", "events", "fcd", "tripinfo", "summary", "statistics", "collisions", "vehroute")
+TABLES = ("trains", "units", "links", "events", *(kind.name for kind in KINDS))
 
 
 @dataclass(frozen=True)
