@@ -20,7 +20,7 @@ def assumed(rng: np.random.Generator, step: float, *, disturbed: bool, lag: bool
     given, blur = rng.uniform(0.5, 1.0, n), 0.5 * disturbed
     return Assumed(
         braking=given - scatter, hardest=1.0 + scatter, scatter=scatter, drift=blur + rng.uniform(0.0, 0.3, n) * disturbed,
-        lag=rng.uniform(0.1, 3.0, n) * lag, uncertainty=rng.uniform(0.0, 8.0, n) * disturbed, blur=blur,
+        lag=rng.uniform(0.1, 3.0, n) * lag, surge=np.zeros(n), uncertainty=rng.uniform(0.0, 8.0, n) * disturbed, blur=blur,
     )  # fmt: skip
 
 

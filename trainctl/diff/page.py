@@ -75,7 +75,7 @@ def _page(report: Report) -> str:
 <meta http-equiv="Content-Security-Policy" content="{POLICY}">
 <link rel="icon" href="data:,">
 <title>{escape(report.b)} against {escape(report.a)} · trainctl</title>
-<style>{_file("trainctl.record", "report.css")}{_file("trainctl.diff", "diff.css")}</style>
+<style>{_file("trainctl.report", "report.css")}{_file("trainctl.diff", "diff.css")}</style>
 </head>
 <body>
 <header><div><h1>Comparison of logs</h1>

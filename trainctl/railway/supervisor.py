@@ -34,7 +34,8 @@ no margin touched: before a fixed point ``d >= D(v)``, behind a moving train ``d
    speed is positive it grows), so 2. holds with ``braking <= hardest``.
 4. An actuator of lag r follows what is ordered late: ``a' = (u - a) / r``. Under full braking the speed ``v + r (a + braking)``
    falls just as that of a train without lag, and is never below v, so it takes the place of v before points; before speed limits
-   ``v + r a`` does, the speed reached once no more is ordered.
+   ``v + r max(a, 0)`` does, the speed reached once no more is ordered. Where the slope changes by ds the force follows late too,
+   which gives the speed ``r g ds``; over a whole route that is at most ``surge``.
 
 Holding the speed v behind a train of the same speed therefore needs v T beyond the margin: the train ahead may begin to brake
 now, its follower learns of it one step later.
@@ -114,6 +115,7 @@ class Assumed(NamedTuple):
     scatter: Floats  # m/s2, >= 0: its acceleration may exceed the ordered one by this
     drift: Floats  # m/s, >= 0: it may advance faster than its measured speed by this
     lag: Floats  # s, of its slowest actuator, 0: none
+    surge: Floats  # m/s, >= 0: its speed may rise by this where the slope changes and its actuators follow late
     uncertainty: Floats  # m, >= 0, of its measured position
     blur: float  # m/s, of every measured speed
 
@@ -154,7 +156,7 @@ class Verdict(NamedTuple):
 def as_ordered(rate: float, trains: int) -> Assumed:
     """Assume that all trains do just what is ordered, and brake with ``rate`` [m/s2]."""
     full, none = np.full(trains, rate), np.zeros(trains)
-    return Assumed(full, full, none, none, none, none, 0.0)
+    return Assumed(full, full, none, none, none, none, none, 0.0)
 
 
 def no_targets() -> Targets:
@@ -273,7 +275,7 @@ class _Braking(NamedTuple):
 def _braking(params: Params, relied: Assumed, speed: Floats, now: Floats, targets: Targets, step: float, theta: float) -> _Braking:
     i, j = targets.train, targets.other
     a_train, opposing, stop = targets.kind == TRAIN, targets.kind == OPPOSING, targets.kind == STOP
-    more = relied.drift + relied.lag * np.maximum(now + relied.braking, 0.0)
+    more = relied.drift + relied.surge + relied.lag * np.maximum(now + relied.braking, 0.0)
     v, b = speed[i] + np.where(stop, relied.drift[i], more[i]), relied.braking[i]  # the room to a stop counts the lag already
     own = stopping_distance(v, b, step, theta)
     known = j >= 0
@@ -322,7 +324,7 @@ def _before_limits(
     params: Params, relied: Assumed, speed: Floats, now: Floats, limits: Limits, step: float, theta: float
 ) -> Floats:
     """Greatest acceleration each limit leaves its train [m/s2], shape (k,)."""
-    settled = np.maximum(speed + relied.lag * now, 0.0) if relied.lag.any() else speed
+    settled = speed + relied.lag * np.maximum(now, 0.0) if relied.lag.any() else speed
     train = limits.train
     v, top = settled[train], settled[train] + (params.greatest_mps2 + relied.scatter[train]) * step
     rate = np.full(len(v), np.inf)
@@ -334,8 +336,9 @@ def _before_limits(
     far = (
         0.5 * top**2 / planned[train] + 4.0 * step * top + sooner[train] + relied.drift[train] * (top / planned[train] + 2.0 * step)
     )
-    near = np.flatnonzero((limits.speed < top) & (limits.distance < far))
-    i, v, limit = train[near], v[near], limits.speed[near]
+    lowered = np.maximum(limits.speed - relied.surge[train], 0.0)
+    near = np.flatnonzero((lowered < top) & (limits.distance < far))
+    i, v, limit = train[near], v[near], lowered[near]
     slower = relied.drift[i] * (np.maximum(v - limit, 0.0) / planned[i] + 2.0 * step)
     room = limits.distance[near] - sooner[i] - slower
     emergency, service = ((speed_after(room, limit, v, b[i], step, theta) - v) / step for b in (relied.braking, planned))

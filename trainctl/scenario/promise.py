@@ -151,6 +151,7 @@ def assume(p: Prepared) -> Assumed:
         scatter=scatter,
         drift=found.position / p.scenario.run.step_s + kicks + (rules.speed_uncertainty_mps or 0.0),
         lag=found.lag,
+        surge=found.lag * (found.fall + found.climb),
         uncertainty=found.measured + (rules.position_uncertainty_m or 0.0),
         blur=rules.speed_uncertainty_mps or 0.0,
     )
@@ -284,6 +285,7 @@ def told(p: Prepared) -> dict[str, Any]:
         "disturbances_mps2": {name: value for name, value in counted.items() if value > 0.0},
         "advance_beyond_speed_mps": float(assumed.drift.max()),
         "actuator_lag_s": float(assumed.lag.max()),
+        "surge_mps": float(assumed.surge.max()),
         "margin_m": rules.margin_m,
         "position_uncertainty_m": float(assumed.uncertainty.max()),
         "speed_uncertainty_mps": assumed.blur,
@@ -322,6 +324,8 @@ def sentences(said: dict[str, Any]) -> list[str]:
         lines.append(f"a train advances by at most {said['advance_beyond_speed_mps']:.4g} m/s more than its measured speed")
     if said["actuator_lag_s"]:
         lines.append(f"actuators lag by at most {said['actuator_lag_s']:.4g} s")
+    if said["surge_mps"]:
+        lines.append(f"where the slope changes a speed rises by at most {said['surge_mps']:.4g} m/s until they follow")
     measured = (
         f"positions are measured to {said['position_uncertainty_m']:.4g} m, speeds to {said['speed_uncertainty_mps']:.4g} m/s"
     )

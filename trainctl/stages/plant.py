@@ -254,18 +254,19 @@ class Units:
     def _asked(self, own: Floats, moved: Floats, displacement: Floats, mean: Floats) -> Floats:
         """Acceleration that drives every train over the step [m/s2], (n,).
 
-        Where actuators lag it is what they approach; else the mean, or the one that explains the displacement where a law pulls
-        first and brakes later within the step.
+        Where actuators lag it is what they approach; else the mean, or the one that explains the displacement where that is more (a
+        law pulls first and brakes later within the step) or less than full braking (it brakes first).
         """
         heads = self.p.heads
         v, after = own[heads, SPEED], moved[heads, SPEED]
         if self.p.plant.STATES > FORCE:
-            gained = self.lag * (self.acceleration(moved) - self.acceleration(own)) / self.step_s
+            gained = self.lag * (np.maximum(self.acceleration(moved), 0.0) - np.maximum(self.acceleration(own), 0.0)) / self.step_s
             return np.where(after > 0.0, mean + gained, mean)
         beyond = displacement - 0.5 * (v + after) * self.step_s
         explained = mean + 2.0 * beyond / self.step_s**2
         swings = (np.abs(beyond) > WITHIN_M * self.step_s) & (after > 0.0)
-        return np.where(swings, explained, mean)
+        counts = (explained > mean) | (explained < -self.p.supervision.emergency_mps2)
+        return np.where(swings & counts, explained, mean)
 
     def _climbing(self, own: Floats) -> Floats:
         """Weight along the track per mass [N/kg], (U,)."""
