@@ -100,6 +100,8 @@ def entries(roster: Roster, came: Bools, due: Sequence[int], t: float, held: Hel
 
     ``out`` says who keeps out those that no switch does.
     """
+    if came.all():
+        return []
     late = np.flatnonzero(~came & (roster.depart <= t + 1e-9)).tolist()
     first = {int(roster.edge[i]): i for i in reversed(due)} if late else {}
     found = []
@@ -157,6 +159,8 @@ class Waiting:
 
     def new(self, t: float, found: Sequence[Wait], due: Mapping[int, float], s: State) -> Iterator[tuple[str, dict[str, Any]]]:
         """Events at ``t`` [s], as kind and fields; ``due`` has the time since which trains wait that are to enter [s]."""
+        if not found and np.isnan(s.since).all():
+            return
         of = {w.train: w for w in reversed(found)}  # where a train waits for two, the first is told
         waits = np.zeros(len(self.ids), bool)
         waits[list(of)] = True

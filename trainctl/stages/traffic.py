@@ -112,6 +112,8 @@ class Traffic:
 
     def due(self, t: float, s: State) -> list[int]:
         """Trains that are to come now: of each edge the first that waits there."""
+        if s.came.all():
+            return []
         first: dict[int, int] = {}
         for i in np.flatnonzero(~s.came & (self.roster.depart <= t + 1e-9)).tolist():
             first.setdefault(int(self.roster.edge[i]), i)
@@ -191,6 +193,8 @@ class Traffic:
     def _stops(self, t: float, seen: Seen, speed: Floats, overrun: Floats, s: State) -> tuple[State, tuple[Ints, Floats], Bools]:
         """Arrive at and leave stops; the trains that have one ahead and the room to it [m], and who stops soon."""
         trains, rooms, n = [], [], len(speed)
+        if not self.stops_of.any():
+            return s, nothing(n).stops, np.zeros(n, bool)
         standing = s.standing
         s = s._replace(next_stop=s.next_stop.copy(), stands_until=s.stands_until.copy(), stopping=s.stopping.copy())
         for i in np.flatnonzero(seen.present & (s.next_stop < self.stops_of)).tolist():
