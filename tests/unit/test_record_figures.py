@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 from trainctl.errors import InputError
 from trainctl.figures import style
 from trainctl.figures.catalogue import FIGURES, PAPER, applicable, comparison, figure, plot, prepare
+from trainctl.plants.actuated_units import COLUMNS as UNIT_EXTRAS
 from trainctl.record.folder import about_run, write_info
-from trainctl.record.recorder import UNIT_EXTRAS, Recorder, standard_tables
+from trainctl.record.recorder import Recorder, standard_tables
 from trainctl.runs.run import Run
 
 STEPS = 60

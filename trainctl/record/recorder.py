@@ -43,10 +43,6 @@ SEGMENT_GROUPS = 16
 
 #: Optional columns of trains.parquet: energies [J] since the train's last row, one per entry of ``signals.POWERS``.
 ENERGIES = tuple(f"{power}_j" for power in POWERS)
-#: Optional columns of units.parquet, for the laws and plants that know them.
-UNIT_EXTRAS = (
-    "law_input", "fault_mps3", "fault_estimate_mps3", "acceleration_mps2", "acceleration_estimate_mps2",
-)  # fmt: skip
 
 _DTYPES = {"float": np.float64, "int": np.int32, "bool": np.bool_}
 
@@ -72,7 +68,7 @@ def standard_tables(
     watched : sequence of str
         The law's ``WATCHED``: each gives two columns of trains, ``<watched>_min`` and ``<watched>_max``.
     train_extras, unit_extras : sequence of str
-        Further columns of numbers: ``ENERGIES``, disturbances; any of ``UNIT_EXTRAS``.
+        Further columns of numbers: ``ENERGIES``, disturbances; the plant's ``COLUMNS``.
     """
     tables: dict[str, Columns] = {
         "trains": {

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from trainctl.monitors import bounds as monitor
-from trainctl.record.recorder import ENERGIES, UNIT_EXTRAS, Recorder, standard_tables
+from trainctl.record.recorder import ENERGIES, Recorder, standard_tables
 from trainctl.signals import POSITION, SPEED, Bools, Demand, Disturbed, Extremes, Floats, Formed, Motion, Row, Scene, Seen
 from trainctl.topology import graph
 
@@ -36,10 +36,10 @@ class Journal:
     def __init__(self, folder: Path, p: Prepared, resume: Mapping[str, Any] | None = None) -> None:
         self.p = p
         self.silent = False  # while a run that is resumed begins again
-        self.has_units = p.scenario.plant.kind != "point"
+        self.has_units = p.plant.UNITS
         watched = tuple(getattr(p.law, "WATCHED", ())) if self.has_units and not p.sampled else ()
         self.watched = watched
-        self.extras = UNIT_EXTRAS if p.scenario.plant.kind == "actuated_units" else ()
+        self.extras = p.plant.COLUMNS
         self.disturbances = DISTURBANCES if p.scenario.disturbance else ()
         tables = standard_tables(
             p.scenario.ids, p.line.track_ids, p.line.edges, units=self.has_units, watched=watched,
