@@ -132,7 +132,7 @@ def find_observer(name: str) -> Any:
 
 def find_plant(name: str) -> Any:
     """The module of a plant; other modules of the folder are not one."""
-    known = [m.name for m in pkgutil.iter_modules(plants.__path__) if hasattr(_module(plants, m.name), "UNITS")]
+    known = [m.name for m in pkgutil.iter_modules(plants.__path__) if hasattr(_module(plants, m.name), "relied_on")]
     if name not in known:
         raise InputError(f"plant.kind = {name}: no such plant; known: {', '.join(known)}")
     return _module(plants, name)

@@ -321,10 +321,9 @@ class Plant(Protocol):
         self, params: Any, consists: Consists, faults: Sequence[Any], trains: Sequence[str], braking: float, top: Floats,
         fall: Floats, deviations: float,
     ) -> Reliance:  # fmt: skip
-        """What protection may rely on where it orders ``braking`` [m/s2].
+        """What protection may rely on where it orders ``braking`` [m/s2], up to the speed ``top`` (n,) [m/s].
 
-        ``top`` (n,) [m/s] is the greatest speed, ``fall`` (n,) [m/s2] gravity on the steepest descent, and what is random without a
-        bound is counted as so many standard ``deviations``.
+        ``fall`` (n,) [m/s2] is gravity on the steepest descent; unbounded noise counts as so many standard ``deviations``.
         """
 
 

@@ -30,7 +30,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -40,16 +40,20 @@ from trainctl.controllers import stated
 from trainctl.controllers.powers import BLOCK, signed_powers
 from trainctl.davis import running_resistance
 from trainctl.kernels import inlined
-from trainctl.signals import POSITION, SPEED, Floats, Ints, Links, Scene, Table, leader_at
+from trainctl.signals import POSITION, SPEED, ContinuousLaw, Floats, Ints, Links, Scene, Table, leader_at
+
+if TYPE_CHECKING:
+    from trainctl.controllers import emu_finite_time
+
+    module: ContinuousLaw = emu_finite_time
 
 CLOCK: Literal["continuous"] = "continuous"
-ORDER: Literal["parallel"] = "parallel"
+ORDER: Literal["parallel", "chain"] = "parallel"
 JOIN: Literal["start_condition"] = "start_condition"
 WATCHED = ("interval_m",)
 
-#: Figures -> their numbers in the paper.
+#: Figures -> their numbers in the paper; rows of a comparison -> the keys of [controller] that make them.
 FIGURES = {"unit_speeds": "fig3", "speed_over_position": "fig4", "couplers": "fig5", "gaps": "fig6"}
-#: Rows of a comparison -> the keys of [controller] that make them.
 COMPARED: dict[str, dict[str, Any]] = {"emu_finite_time": {"alpha_1": 0.9}, "ordinary_consensus": {"alpha_1": 1.0}}
 
 #: Columns of a message: head and tail relative to the leader (the tail moved forward by the units ahead of it), train length.

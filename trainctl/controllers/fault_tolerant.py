@@ -40,17 +40,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
 from trainctl.controllers import stated
 from trainctl.kernels import inlined
-from trainctl.signals import POSITION, SPEED, Floats, Ints, Links, Scene, Table, leader_at
+from trainctl.signals import POSITION, SPEED, ContinuousLaw, Floats, Ints, Links, Scene, Table, leader_at
+
+if TYPE_CHECKING:
+    from trainctl.controllers import fault_tolerant
+
+    module: ContinuousLaw = fault_tolerant
 
 CLOCK: Literal["continuous"] = "continuous"
-ORDER: Literal["chain"] = "chain"
+ORDER: Literal["parallel", "chain"] = "chain"
 MESSAGE = 4
 WATCHED = ("spacing_error_m", "speed_error_mps", "q_error_mps")
 

@@ -42,7 +42,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -50,7 +50,12 @@ from pydantic import Field
 
 from trainctl.controllers import stated
 from trainctl.davis import resistance, resistance_of
-from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, Reference, Scene, Table, Trains, leader_at
+from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, Reference, SampledLaw, Scene, Table, Trains, leader_at
+
+if TYPE_CHECKING:
+    from trainctl.controllers import fully_distributed
+
+    module: SampledLaw = fully_distributed
 
 CLOCK: Literal["sampled"] = "sampled"
 

@@ -33,7 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from pydantic import Field
@@ -41,7 +41,12 @@ from scipy.sparse import csgraph
 
 from trainctl.controllers import robust_gain, robust_theory, stated
 from trainctl.errors import InputError
-from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, Scene, Table, Trains, restrict
+from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, SampledLaw, Scene, Table, Trains, restrict
+
+if TYPE_CHECKING:
+    from trainctl.controllers import robust_constrained
+
+    module: SampledLaw = robust_constrained
 
 CLOCK: Literal["sampled"] = "sampled"
 

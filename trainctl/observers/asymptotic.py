@@ -31,14 +31,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
 from trainctl.davis import running_resistance
 from trainctl.kernels import inlined
-from trainctl.signals import POSITION, SPEED, Consists, Floats, Ints, Scene, Table
+from trainctl.signals import POSITION, SPEED, Consists, Floats, Ints, Observer, Scene, Table
+
+if TYPE_CHECKING:
+    from trainctl.observers import asymptotic
+
+    module: Observer = asymptotic
 
 WIDTH = 6  # with one sinusoid; see width()
 CORRECTIONS = 5

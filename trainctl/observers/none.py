@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from trainctl.kernels import inlined
-from trainctl.signals import Floats, Scene, Table
+from trainctl.signals import Floats, Observer, Scene, Table
+
+if TYPE_CHECKING:
+    from trainctl.observers import none
+
+    module: Observer = none
 
 CORRECTIONS = 0
 

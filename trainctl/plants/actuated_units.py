@@ -57,13 +57,12 @@ from trainctl.plants.coupled_units import room as room
 from trainctl.plants.coupled_units import sure_braking as sure_braking
 from trainctl.plants.faults import Fault, Faults, effectiveness, fault_rate, tabulated
 from trainctl.plants.faults import violations as fault_violations
-from trainctl.signals import FORCE, GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Reliance, Scene
+from trainctl.signals import FORCE, GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Reliance, Scene, UnitPlant
 
 if TYPE_CHECKING:
     from trainctl.plants import actuated_units
-    from trainctl.signals import UnitPlant
 
-    plant: UnitPlant = actuated_units
+    module: UnitPlant = actuated_units
 
 UNITS, STATES = True, 3
 COLUMNS: tuple[str, ...] = (

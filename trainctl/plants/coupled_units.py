@@ -29,13 +29,12 @@ from trainctl.davis import resistance, running_resistance
 from trainctl.kernels import inlined
 from trainctl.plants import faults as actuators
 from trainctl.plants.faults import Fault
-from trainctl.signals import GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Reliance, Scene, Table
+from trainctl.signals import GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Reliance, Scene, Table, UnitPlant
 
 if TYPE_CHECKING:
     from trainctl.plants import coupled_units
-    from trainctl.signals import UnitPlant
 
-    plant: UnitPlant = coupled_units
+    module: UnitPlant = coupled_units
 
 UNITS, STATES = True, 2
 COLUMNS: tuple[str, ...] = ()

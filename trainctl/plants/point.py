@@ -21,13 +21,12 @@ from trainctl.davis import resistance as resistance
 from trainctl.davis import resistance_of
 from trainctl.plants import faults as actuators
 from trainctl.plants.faults import Fault
-from trainctl.signals import GRAVITY, POSITION, SPEED, Bools, Consists, Floats, Reliance, Scene, Table
+from trainctl.signals import GRAVITY, POSITION, SPEED, Bools, Consists, Floats, PointPlant, Reliance, Scene, Table
 
 if TYPE_CHECKING:
     from trainctl.plants import point
-    from trainctl.signals import PointPlant
 
-    plant: PointPlant = point
+    module: PointPlant = point
 
 UNITS, STATES = False, 2
 COLUMNS: tuple[str, ...] = ()
