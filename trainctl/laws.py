@@ -1,4 +1,4 @@
-"""The modules a scenario names: laws of ours, of other packages or in a file, and observers."""
+"""The modules a scenario names: laws of ours, of other packages or in a file, observers and plants."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from trainctl import controllers, observers
+from trainctl import controllers, observers, plants
 from trainctl.errors import InputError
 
 #: Where other packages offer their laws.
@@ -26,6 +26,21 @@ def laws() -> list[str]:
     """Names of the laws that come with the package and of those other packages offer."""
     own = [m.name for m in pkgutil.iter_modules(controllers.__path__) if hasattr(_module(controllers, m.name), "CLOCK")]
     return sorted({*own, *(e.name for e in importlib.metadata.entry_points(group=ENTRY_POINTS))})
+
+
+def shipped(name: str) -> Any:
+    """The module of a law that comes with the package, or None."""
+    if not name.isidentifier() or all(m.name != name for m in pkgutil.iter_modules(controllers.__path__)):
+        return None
+    module = _module(controllers, name)
+    return module if hasattr(module, "CLOCK") else None
+
+
+def compared() -> dict[str, Any]:
+    """Rows of a comparison -> the module of their law: the package's own, sampled ones first, SUMO's trains last."""
+    modules = [_module(controllers, m.name) for m in pkgutil.iter_modules(controllers.__path__)]
+    found = [module for clock in ("sampled", "continuous", "none") for module in modules if getattr(module, "CLOCK", "") == clock]
+    return {row: module for module in found for row in getattr(module, "COMPARED", ())}
 
 
 def _module(package: Any, name: str) -> Any:
@@ -52,10 +67,8 @@ def find_law(name: str, folder: Path = Path()) -> Any:
         if not file.is_file():
             raise InputError(f"controller.law = {name}: no such file")
         return _complete(name, partial(_law_file, file))
-    if name.isidentifier() and any(m.name == name for m in pkgutil.iter_modules(controllers.__path__)):
-        module = _module(controllers, name)
-        if hasattr(module, "CLOCK"):
-            return module
+    if (module := shipped(name)) is not None:
+        return module
     for entry in importlib.metadata.entry_points(group=ENTRY_POINTS, name=name):
         return _complete(name, entry.load)
     raise InputError(f"controller.law = {name}: no such law; known: {', '.join(laws())}")
@@ -102,7 +115,8 @@ def _complete(name: str, load: Any) -> Any:
     clock = getattr(module, "CLOCK", None)
     if clock not in PARTS:
         raise InputError(f'controller.law = {name}: CLOCK = {clock!r}: must be "sampled" or "continuous"')
-    missing = [part for part in PARTS[clock] if not hasattr(module, part)]
+    needed = PARTS[clock] + (("watched_bounds",) if clock == "continuous" and getattr(module, "WATCHED", ()) else ())
+    missing = [part for part in needed if not hasattr(module, part)]
     if missing:
         raise InputError(f"controller.law = {name}: a {clock} law needs {', '.join(missing)}")
     return module
@@ -114,3 +128,28 @@ def find_observer(name: str) -> Any:
     if name not in known:
         raise InputError(f"observer.kind = {name}: no such observer; known: {', '.join(known)}")
     return _module(observers, name)
+
+
+def find_plant(name: str) -> Any:
+    """The module of a plant; other modules of the folder are not one."""
+    known = [m.name for m in pkgutil.iter_modules(plants.__path__) if hasattr(_module(plants, m.name), "relied_on")]
+    if name not in known:
+        raise InputError(f"plant.kind = {name}: no such plant; known: {', '.join(known)}")
+    return _module(plants, name)
+
+
+def plants_of(law: Any) -> tuple[str, ...]:
+    """Plants a law runs on; one that does not say runs on those without actuators of their own."""
+    usual = ("coupled_units",) if law.CLOCK == "continuous" else ("point", "coupled_units")
+    return tuple(getattr(law, "PLANTS", usual))
+
+
+def unfit(law: Any, name: str, plant: str, observer: str) -> list[str]:
+    """Plant or observer that this law does not go with."""
+    found = []
+    if plant not in plants_of(law):
+        found.append(f"plant.kind = {plant}: law {name} runs on {', '.join(plants_of(law))}")
+    known = getattr(law, "OBSERVERS", ("none",))
+    if observer not in known:
+        found.append(f"observer.kind = {observer}: law {name} works with {', '.join(known)}")
+    return found

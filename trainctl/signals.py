@@ -241,6 +241,9 @@ class ContinuousLaw(Protocol):
     def watch(self, i: int, constants: Any, leader: Floats, first: Ints, own: Floats, links: Links, out: Floats) -> None:
         """Write the constrained quantities of train ``i`` into ``out``; here ``own`` is that of all trains (this is a monitor)."""
 
+    def watched_bounds(self, params: Any, scene: Scene) -> tuple[Floats, Floats]:
+        """Lower and upper bounds of the quantities ``watch`` writes, (n, q) each; a law that watches nothing needs none."""
+
 
 class Observer(Protocol):
     """Estimates per unit, integrated with plant and law; compiled like a continuous law.
@@ -269,11 +272,89 @@ class Observer(Protocol):
     def rate(self, i: int, constants: Any, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats) -> None:
         """Write d(estimate)/dt into ``out``; ``applied`` [N] is what the limits left of the demand."""
 
+    def fault_estimate(self, constants: Any, estimate: Floats) -> Floats:
+        """What it takes the faults for [m/s3], (U,), for logs; NaN where it estimates none."""
+
+    def acceleration_estimate(self, constants: Any, estimate: Floats) -> Floats:
+        """Estimated acceleration [m/s2], (U,), for logs; NaN where it estimates none."""
+
+
+class Reliance(NamedTuple):
+    """What protection may rely on of every train, shape (n,)."""
+
+    braking: Floats  # m/s2, what brakes, faults and slope leave of the braking that is ordered
+    pull: Floats  # m/s2, greatest force per mass at the greatest speed; inf if there is no limit
+    bias: Floats  # m/s2, what faulty actuators add to the input
+    late: Floats  # m/s2, how much running resistance may fall until actuators have followed
+    noise: Floats  # m/s2, greatest of the plant's own
+    lag: Floats  # s, of actuators
+
 
 class Plant(Protocol):
-    """Motion of the units of train ``i``; compiled like a continuous law. ``own`` has ``STATES`` columns."""
+    """What moves the trains: a module of this shape in ``trainctl.plants``, and of that of ``PointPlant`` or ``UnitPlant``."""
 
-    STATES: int
+    UNITS: bool  # trains of units, integrated in sub-steps with law and observer; else points, moved by an exact map
+    STATES: int  # columns of ``own``
+    COLUMNS: tuple[str, ...]  # what a plant of units adds to units.parquet
+    CLAMPS: tuple[str, ...]  # keys of [plant] and [bounds] at which the plant clamps by itself
+    Params: Any  # frozen pydantic model: the keys of [plant]; for units, those of ``coupled_units`` are among them
+
+    def violations(self, params: Any, scene: Scene, faults: Sequence[Any]) -> list[str]:
+        """Every rule about this plant and its ``[[fault]]`` tables that fails, as in ``SampledLaw``."""
+
+    def lead(self, steps: int) -> float:
+        """Theta of ``Scene.lead`` where an acceleration is held for ``steps`` steps of the simulator."""
+
+    def balanced(self, own: Floats, consists: Consists, gradient: Floats | None = None) -> Floats:
+        """State (U, STATES) at the positions and speeds of ``own`` (U, 2 or 3); forces, if they are a state, accelerate nothing."""
+
+    def noise_hold(self, params: Any) -> float | None:
+        """Time for which a sample of the plant's own noise is held [s]; None: it has none, and needs no seed."""
+
+    def room(self, consists: Consists, lower: Floats, upper: Floats) -> tuple[Floats, Floats]:
+        """Least and greatest input [m/s2], (n,) each, every train can give in the speed band ``lower`` to ``upper`` (n,)."""
+
+    def sure_braking(self, params: Any, consists: Consists, top: Floats) -> Floats:
+        """Deceleration [m/s2], (n,), every train can give on the level at any speed up to ``top`` (n,); inf if unlimited."""
+
+    def relied_on(
+        self, params: Any, consists: Consists, faults: Sequence[Any], trains: Sequence[str], braking: float, top: Floats,
+        fall: Floats, deviations: float,
+    ) -> Reliance:  # fmt: skip
+        """What protection may rely on where it orders ``braking`` [m/s2], up to the speed ``top`` (n,) [m/s].
+
+        ``fall`` (n,) [m/s2] is gravity on the steepest descent; unbounded noise counts as so many standard ``deviations``.
+        """
+
+
+class PointPlant(Plant, Protocol):
+    """Trains as points, moved from step to step by an exact map: see ``plants.point`` for ``Kick`` and ``Moved``."""
+
+    def constants(
+        self, params: Any, consists: Consists, resistance_factor: Floats | None = None, gradient: Floats | None = None
+    ) -> Any:
+        """Arrays of all trains; those of ``plants.point.Constants`` are among them."""
+
+    def advance(self, constants: Any, own: Floats, acceleration: Floats, step: float, kick: Any) -> Any:
+        """One step of all trains that are asked for ``acceleration`` (n,)."""
+
+
+class UnitPlant(Plant, Protocol):
+    """Motion of the units of train ``i``; ``limit`` and ``rate`` are compiled like a continuous law."""
+
+    def constants(
+        self, params: Any, consists: Consists, gradient: Floats | None = None, resistance_factor: Floats | None = None,
+        faults: Sequence[Any] = (), trains: Sequence[str] = (),
+    ) -> Any:  # fmt: skip
+        """For numba, with ``first`` and ``units``, whose first columns are those of ``coupled_units``; ``gradient`` as there."""
+
+    def make_noise(self, params: Any, constants: Any, seed: int, sample: int | None) -> None:
+        """Write the sample of that number of the plant's own noise into ``constants``, or none."""
+
+    def columns(
+        self, constants: Any, t: float, own: Floats, applied: Floats, fault_estimate: Floats, acceleration_estimate: Floats
+    ) -> tuple[Floats, ...]:
+        """Values of ``COLUMNS`` at ``t``, (U,) each; ``applied`` (U,) is what the limits left of the demand [N]."""
 
     def limit(self, i: int, constants: Any, own: Floats, applied: Floats) -> bool:
         """Clip ``applied`` [N] to what the units can do, in place; True if a limit acted."""
@@ -281,10 +362,7 @@ class Plant(Protocol):
     def rate(
         self, i: int, constants: Any, t: float, inside: float, own: Floats, applied: Floats, out: Floats, power: Floats
     ) -> None:
-        """Write d(own)/dt into ``out`` and the train's powers [W] into ``power`` (6,), see ``POWERS``.
-
-        ``inside`` is a time within the piece meant where something jumps at ``t``.
-        """
+        """Write d(own)/dt into ``out``, the train's ``POWERS`` [W] into ``power`` (6,); ``inside`` as in ``leader_at``."""
 
 
 #: What ``Plant.rate`` writes into ``power``; each is the rate of an energy [W]. Kinetic plus coupler energy changes by

@@ -49,9 +49,9 @@ def test_shapes_finite_and_no_objections(observer: Any) -> None:
     assert observer.violations(params, scene) == []
     assert estimate.shape == (ROWS, observer.width(params)) and estimate.dtype == np.float64
     assert all(np.isfinite(a).all() for a in observed(observer, scene, estimate, applied))
-    if observer.CORRECTIONS:
-        found = observer.fault_estimate(observer.constants(params, scene), estimate)
-        assert found.shape == (ROWS,) and np.isfinite(found).all()
+    for logged in (observer.fault_estimate, observer.acceleration_estimate):
+        found = logged(observer.constants(params, scene), estimate)
+        assert found.shape == (ROWS,) and (np.isfinite(found) if observer.CORRECTIONS else np.isnan(found)).all()
 
 
 def test_repeatable_and_inputs_untouched(observer: Any) -> None:

@@ -1,4 +1,4 @@
-"""Every plant keeps the same contract: those of units are found by their ``STATES``, that of point trains has a contract of its own."""
+"""Every plant keeps the same contract, found by its ``relied_on``; those of units and those of points have one of their own besides."""
 
 from __future__ import annotations
 
@@ -12,9 +12,12 @@ from units import ROWS, TRAINS, arrays, at_rest, disturbed, modules, moved, othe
 
 from trainctl import plants
 from trainctl.plants import coupled_units, point
+from trainctl.plants.faults import Fault
+from trainctl.scenario.tables import BoundsTable
 from trainctl.signals import FORCE, POSITION, POWERS, SPEED, Consists, Floats, Scene
 
-PLANTS = modules(plants, "STATES")
+ALL = modules(plants, "relied_on")
+PLANTS = {name: module for name, module in ALL.items() if module.UNITS}
 
 
 @pytest.fixture(params=sorted(PLANTS))
@@ -50,12 +53,12 @@ def energy(scene: Scene) -> Floats:
 
 
 def test_there_are_plants() -> None:
-    assert {"coupled_units", "actuated_units"} <= set(PLANTS)
+    assert {"coupled_units", "actuated_units"} <= set(PLANTS) and "point" in set(ALL) - set(PLANTS)
 
 
 def test_shapes_finite_and_no_objections(plant: Any) -> None:
     scene, applied = case(plant)
-    assert plant.violations(plant.Params(), scene) == []
+    assert plant.violations(plant.Params(), scene, ()) == []
     assert scene.own.shape == (ROWS, plant.STATES)
     assert all(np.isfinite(a).all() for a in moving(plant, scene, applied))
     still = scene._replace(own=scene.own * np.array([1.0, 0.0, 1.0])[: plant.STATES])
@@ -140,6 +143,142 @@ def test_a_plant_that_breaks_the_contract_is_found_out() -> None:
     for rate, check in checks:
         with pytest.raises(AssertionError):
             check(SimpleNamespace(**{**vars(coupled_units), "rate": rate}))
+
+
+# What every plant says of itself
+
+
+@pytest.fixture(params=sorted(ALL))
+def any_plant(request: pytest.FixtureRequest) -> Any:
+    return ALL[request.param]
+
+
+BRAKES = {
+    "braking": np.full(ROWS, 4e4),
+    "braking_power": np.full(ROWS, 2.4e6),
+    "traction": np.full(ROWS, 3e4),
+    "traction_power": np.full(ROWS, 1.2e6),
+}
+TOP = np.array([80.0, 40.0, 60.0, 20.0])
+
+
+def clamped(plant: Any) -> Any:
+    """Its keys, with clamps where it has some."""
+    values = {"input_lower_mps2": -0.7, "input_upper_mps2": 0.6, "speed_lower_mps": 0.0, "speed_upper_mps": 90.0}
+    return plant.Params(**{key: values[key] for key in plant.CLAMPS})
+
+
+def test_clamps_are_keys_of_the_plant_and_of_the_bounds(any_plant: Any) -> None:
+    assert set(any_plant.CLAMPS) <= any_plant.Params.model_fields.keys() & BoundsTable.model_fields.keys()
+
+
+def test_faults_are_taken_or_refused(any_plant: Any) -> None:
+    scene = at_rest(any_plant.STATES)
+    fault = Fault(train=scene.trains[0], unit=2, kind="effectiveness", effectiveness=0.5)
+    found = any_plant.violations(any_plant.Params(), scene, [fault])
+    if any_plant.STATES > FORCE:
+        assert found == []
+        assert any_plant.violations(any_plant.Params(), scene, [fault.model_copy(update={"unit": 9})]) != []
+    else:
+        name = any_plant.__name__.rpartition(".")[2]
+        assert found == [f"fault: the plant {name} has no actuators that fail; actuated_units has"]
+
+
+def test_a_state_to_start_from_accelerates_nothing(any_plant: Any) -> None:
+    scene = at_rest()
+    own = any_plant.balanced(scene.own, scene.consists)
+    assert own.shape == (ROWS, any_plant.STATES)
+    np.testing.assert_array_equal(own[:, :2], scene.own)
+    if any_plant.STATES > FORCE:
+        rate, _ = moving(any_plant, scene._replace(own=own), own[:, FORCE])
+        np.testing.assert_allclose(rate[:, SPEED], 0.0, atol=1e-12)
+
+
+def test_its_lead_is_how_it_moves(any_plant: Any) -> None:
+    """Theta of a held acceleration: m Euler steps of points, the exact parabola of units."""
+    held, steps, step = 0.4, 5, 0.2
+    if any_plant.UNITS:
+        way = 0.5 * held * (steps * step) ** 2
+    else:
+        constants, own = any_plant.constants(any_plant.Params(), consists()), OWN.copy()
+        for _ in range(steps):
+            own = any_plant.advance(constants, own, np.full(TRAINS, held), step, kick(0.0)).own
+        way = own[0, POSITION] - OWN[0, POSITION] - OWN[0, SPEED] * steps * step
+    assert any_plant.lead(steps) * held * (steps * step) ** 2 == pytest.approx(way, rel=1e-9)
+
+
+def test_it_can_brake_as_it_says(any_plant: Any) -> None:
+    """Every unit braking with its own share at the greatest speed gives no less, and is not limited; a little more is."""
+    scene, params = at_rest(any_plant.STATES, **BRAKES), clamped(any_plant)
+    sure = any_plant.sure_braking(params, scene.consists, TOP)
+    assert sure.shape == (TRAINS,) and (sure > 0.0).all()
+    if not any_plant.UNITS:
+        np.testing.assert_allclose(sure, 0.7)
+        assert (any_plant.sure_braking(any_plant.Params(), scene.consists, TOP) == np.inf).all()
+        return
+    constants, own = any_plant.constants(params, scene.consists), scene.own.copy()
+    own[:, SPEED] = np.repeat(TOP, ROWS // TRAINS)
+    for i in range(TRAINS):
+        for share, acts in ((0.999, False), (1.01, True)):
+            c, speed = scene.consists, [1.0, TOP[i], TOP[i] ** 2]  # one Davis formula for all, so that is what each unit overcomes
+            asked = c.mass[rows(i)] * (-share * sure[i] * c.rotating[rows(i)])
+            assert np.ptp(c.davis[rows(i)] @ speed) == 0.0
+            assert any_plant.limit(i, constants, own[rows(i)], asked) is acts
+
+
+def test_what_protection_relies_on(any_plant: Any) -> None:
+    scene, params, zero = at_rest(any_plant.STATES, **BRAKES), clamped(any_plant), np.zeros(TRAINS)
+
+    def relied(order: float, fall: Floats, params: Any = params) -> Any:
+        found = any_plant.relied_on(params, scene.consists, (), scene.trains, order, TOP, fall, 6.0)
+        assert all(a.shape == (TRAINS,) and not np.isnan(a).any() for a in found)
+        return found
+
+    gentle, hard = relied(0.1, zero), relied(9.0, zero)
+    np.testing.assert_allclose(gentle.braking, 0.1)  # what is ordered, where brakes give it
+    assert (hard.braking < 9.0).all() and (hard.braking >= any_plant.sure_braking(params, scene.consists, TOP) - 1e-12).all()
+    np.testing.assert_allclose(relied(9.0, zero + 0.2).braking, hard.braking - 0.2)  # descending takes from it
+    assert (gentle.bias == 0.0).all() and (gentle.noise == 0.0).all()
+    assert (gentle.lag > 0.0).all() == (any_plant.STATES > FORCE) == (gentle.late > 0.0).all()
+    assert (gentle.pull > 0.0).all() and np.isfinite(gentle.pull).all()
+
+
+def test_room_is_what_the_units_can_give(any_plant: Any) -> None:
+    scene = at_rest(any_plant.STATES, **BRAKES)
+    low, high = any_plant.room(scene.consists, 0.0 * TOP, TOP)
+    assert (low < 0.0).all() and (high > 0.0).all() and np.isfinite(low).all() == any_plant.UNITS
+    if any_plant.UNITS:  # less in a wider band
+        wider = any_plant.room(scene.consists, 0.0 * TOP, 1.5 * TOP)
+        assert (wider[0] >= low - 1e-12).all() and (wider[1] <= high + 1e-12).all()
+        assert wider[0][0] > low[0] + 0.1 and wider[1][0] < high[0] - 0.05
+
+
+def test_noise_is_drawn_again_alike_and_can_be_left_out(any_plant: Any) -> None:
+    assert any_plant.noise_hold(any_plant.Params()) is None
+    if "noise_variance_m2_per_s6" not in any_plant.Params.model_fields:
+        return
+    scene, params = at_rest(any_plant.STATES), any_plant.Params(noise_variance_m2_per_s6=0.5, noise_hold_s=0.2)
+    assert any_plant.noise_hold(params) == 0.2
+    constants = any_plant.constants(params, scene.consists)
+    still = constants.units.copy()
+    drawn = []
+    for sample in (3, 4, 3):
+        any_plant.make_noise(params, constants, 7, sample)
+        drawn.append(constants.units.copy())
+    assert (drawn[0] == drawn[2]).all() and (drawn[0] != drawn[1]).any()
+    any_plant.make_noise(params, constants, 7, None)
+    assert constants.units.tobytes() == still.tobytes()
+    assert any_plant.relied_on(params, scene.consists, (), scene.trains, 0.1, TOP, 0.0 * TOP, 6.0).noise.min() > 0.0
+
+
+def test_a_column_for_every_name(plant: Any) -> None:
+    scene, applied = case(plant)
+    constants, none = plant.constants(plant.Params(), scene.consists), np.full(ROWS, np.nan)
+    found = plant.columns(constants, 0.0, scene.own, applied, none, none)
+    assert len(found) == len(plant.COLUMNS) and all(column.shape == (ROWS,) for column in found)
+    named = dict(zip(plant.COLUMNS, found, strict=True))
+    if "acceleration_mps2" in named:
+        np.testing.assert_array_equal(named["acceleration_mps2"], moving(plant, scene, applied)[0][:, SPEED])
 
 
 # Point trains

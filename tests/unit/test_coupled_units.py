@@ -212,7 +212,7 @@ def test_room_and_smallest_period_of_the_default_train() -> None:
     """Band 79 to 85 around 80 m/s, units of 80 t, 40 kN, 2.4 MW, 64 kN: 6.27 s."""
     one = np.ones(1)
     consists = train()._replace(braking_power=np.full(4, np.inf))
-    mu, most = shared.room(consists, 79.0 * one, 85.0 * one)
+    mu, most = coupled_units.room(consists, 79.0 * one, 85.0 * one)
     assert mu == pytest.approx([-0.8])
     assert most == pytest.approx([2.4e6 / 85.0 / 80e3])
     period = shared.smallest_period(consists, 80.0 * one, 79.0 * one, 85.0 * one)
@@ -223,17 +223,17 @@ def test_room_and_smallest_period_of_the_default_train() -> None:
 def test_the_weakest_unit_decides() -> None:
     one = np.ones(1)
     consists = train((80e3, 80e3, 80e3, 90e3))
-    _, most = shared.room(consists, 79.0 * one, 85.0 * one)
+    _, most = coupled_units.room(consists, 79.0 * one, 85.0 * one)
     assert most == pytest.approx([2.4e6 / 85.0 / 90e3])
     consists.braking_power[1] = 64e3 * 40.0
-    mu, _ = shared.room(consists, 79.0 * one, 85.0 * one)
+    mu, _ = coupled_units.room(consists, 79.0 * one, 85.0 * one)
     assert mu == pytest.approx([-64e3 * 40.0 / 85.0 / 80e3])
 
 
 def test_rotating_mass_takes_its_share_of_the_room() -> None:
     one = np.ones(1)
     consists = train(rotating=1.1)
-    mu, most = shared.room(consists, 79.0 * one, 85.0 * one)
+    mu, most = coupled_units.room(consists, 79.0 * one, 85.0 * one)
     held, plant = shared.constants(Params(), consists), coupled_units.constants(Params(), consists)
     for speed in (79.0, 82.0, 85.0):
         own = at(consists, speed)
@@ -253,10 +253,10 @@ def test_no_period_where_the_units_cannot_hold_the_band() -> None:
 def test_unlimited_units_leave_no_smallest_period() -> None:
     one = np.ones(1)
     assert shared.smallest_period(train(limits=False), 80.0 * one, 79.0 * one, 85.0 * one).tolist() == [0.0]
-    assert shared.room(train(limits=False), 0.0 * one, 85.0 * one)[1].tolist() == [np.inf]
+    assert coupled_units.room(train(limits=False), 0.0 * one, 85.0 * one)[1].tolist() == [np.inf]
 
 
 def test_unbounded_speed_leaves_nothing_to_say() -> None:
     one = np.ones(1)
-    assert [bound.tolist() for bound in shared.room(train(), -np.inf * one, np.inf * one)] == [[-np.inf], [np.inf]]
+    assert [bound.tolist() for bound in coupled_units.room(train(), -np.inf * one, np.inf * one)] == [[-np.inf], [np.inf]]
     assert shared.smallest_period(train(), 80.0 * one, 79.0 * one, np.inf * one).tolist() == [np.inf]

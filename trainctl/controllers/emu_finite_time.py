@@ -28,21 +28,33 @@ undefined. Every head is pinned, as printed. ls belongs to each pair of trains: 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numba import njit
 from pydantic import Field
 
+from trainctl.controllers import stated
 from trainctl.controllers.powers import BLOCK, signed_powers
+from trainctl.davis import running_resistance
 from trainctl.kernels import inlined
-from trainctl.signals import POSITION, SPEED, Floats, Ints, Links, Scene, Table, leader_at
+from trainctl.signals import POSITION, SPEED, ContinuousLaw, Floats, Ints, Links, Scene, Table, leader_at
+
+if TYPE_CHECKING:
+    from trainctl.controllers import emu_finite_time
+
+    module: ContinuousLaw = emu_finite_time
 
 CLOCK: Literal["continuous"] = "continuous"
-ORDER: Literal["parallel"] = "parallel"
+ORDER: Literal["parallel", "chain"] = "parallel"
 JOIN: Literal["start_condition"] = "start_condition"
 WATCHED = ("interval_m",)
+
+#: Figures -> their numbers in the paper; rows of a comparison -> the keys of [controller] that make them.
+FIGURES = {"unit_speeds": "fig3", "speed_over_position": "fig4", "couplers": "fig5", "gaps": "fig6"}
+COMPARED: dict[str, dict[str, Any]] = {"emu_finite_time": {"alpha_1": 0.9}, "ordinary_consensus": {"alpha_1": 1.0}}
 
 #: Columns of a message: head and tail relative to the leader (the tail moved forward by the units ahead of it), train length.
 HEAD, HEAD_SPEED, TAIL, TAIL_SPEED, LENGTH_OF_TRAIN = range(5)
@@ -209,7 +221,7 @@ def demand(
     for j in range(last + 1):
         row = start + j
         v = own[j, SPEED]
-        drag = units[row, C0] + (units[row, C1] + units[row, C2] * v) * v if v > 0.0 else 0.0
+        drag = running_resistance(v, units[row, C0], units[row, C1], units[row, C2])
         out[j] = units[row, MASS] * drag
     k_p1 = 1.0 / c.p1
     for j in range(last):
@@ -446,7 +458,7 @@ def rehearse(
                         given = min(traction, power / fast)
                     elif -given > braking or -given * fast > braking_power:
                         given = -min(braking, braking_power / fast)
-                    drag = units[u, MASS] * (units[u, C0] + (units[u, C1] + units[u, C2] * v) * v) if v > 0.0 else 0.0
+                    drag = units[u, MASS] * running_resistance(v, units[u, C0], units[u, C1], units[u, C2])
                     stretch = 0.0
                     if u + 1 < b:
                         stretch = own[u, POSITION] - own[u + 1, POSITION] - units[u, LENGTH]
@@ -466,3 +478,23 @@ def rehearse(
         own[:] = base + h * total
         leader[0] = begin + h * leader[1]
     return peak
+
+
+def numbered(controller: Mapping[str, Any], observer: str) -> dict[str, str]:
+    """Figures of the paper that a run with these keys shows."""
+    return {"unit_speeds": "fig7_ordinary_consensus"} if controller.get("alpha_1") == 1.0 else FIGURES
+
+
+def alternative(tables: stated.Tables) -> dict[str, Any]:
+    """Tables that put this law in front of the traffic of another."""
+    (least, wanted, most), alpha = stated.clear_distances(tables), tables["controller"]["alpha_1"]
+    zone = min(600.0, 0.4 * max(wanted - least, 1.0))
+    own = {"law": "emu_finite_time", "emergency_distance_m": least, "emergency_zone_m": zone, "range_m": most, "alpha_1": alpha}
+    return {"controller": own, "run": {**tables["run"], "sub_step_s": 0.0025 if alpha == 1.0 else 0.01}}
+
+
+def on_a_line(tables: stated.Tables, band: dict[str, float]) -> dict[str, Any]:
+    """Tables of its rows in `trainctl compare capacity`."""
+    (least, wanted, _), spacing = stated.clear_distances(tables), tables["topology"]["spacing_m"]
+    own = {"emergency_distance_m": least, "emergency_zone_m": 0.4 * (wanted - least), "range_m": max(10_000.0, 2.0 * spacing)}
+    return {"controller": {**tables["controller"], **own}, "run": {**tables["run"], "sub_step_s": 0.02}}

@@ -39,17 +39,23 @@ References
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from typing import Literal, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
+from trainctl.controllers import stated
 from trainctl.kernels import inlined
-from trainctl.signals import POSITION, SPEED, Floats, Ints, Links, Scene, Table, leader_at
+from trainctl.signals import POSITION, SPEED, ContinuousLaw, Floats, Ints, Links, Scene, Table, leader_at
+
+if TYPE_CHECKING:
+    from trainctl.controllers import fault_tolerant
+
+    module: ContinuousLaw = fault_tolerant
 
 CLOCK: Literal["continuous"] = "continuous"
-ORDER: Literal["chain"] = "chain"
+ORDER: Literal["parallel", "chain"] = "chain"
 MESSAGE = 4
 WATCHED = ("spacing_error_m", "speed_error_mps", "q_error_mps")
 
@@ -58,6 +64,17 @@ JOIN: Literal["start_condition"] = "start_condition"
 PLANTS = ("actuated_units",)
 #: Observers whose ``estimate`` and ``correction`` have the columns below.
 OBSERVERS = ("asymptotic", "intermediate")
+
+#: Figures -> their numbers in the paper.
+FIGURES = {
+    "fault_estimates": "fig2", "acceleration_estimates": "fig3", "position_differences": "fig4", "speed_differences": "fig5",
+    "unit_positions": "fig6", "unit_speeds": "fig7", "unit_forces": "fig8",
+}  # fmt: skip
+
+#: Rows of a comparison -> the keys of [controller] that make them.
+COMPARED: dict[str, dict[str, Any]] = {"fault_tolerant": {}}
+
+#: Columns of ``estimate`` and ``correction``.
 X, V, W = 0, 1, 2
 X_RATE, V_RATE, W_DRIFT, UNCOMPENSATED, STATIC = 0, 1, 2, 3, 4
 
@@ -377,3 +394,33 @@ def _start(params: Params, scene: Scene) -> Iterator[str]:
             f"run.sub_step_s = {h:g}: too large where a force limit acts, r h = {r:g} * {h:g} = {r * h:g} must not exceed "
             f"{STABLE:g} (step at most {STABLE / r:g} s)"
         )
+
+
+# Figures and comparisons
+
+
+def numbered(controller: Mapping[str, Any], observer: str) -> dict[str, str]:
+    """Figures of the paper that a run with these keys and this observer shows."""
+    return {"unit_differences": "fig9_intermediate_estimator"} if observer == "intermediate" else FIGURES
+
+
+def alternative(tables: stated.Tables) -> dict[str, Any]:
+    """Tables that put this law in front of the traffic of another."""
+    error = max((abs(value) for value in stated.errors_allowed(tables)), default=2351.0)
+    types = {key: {"actuator_rate_per_s": 50.0, **kind} for key, kind in tables.get("train_type", {}).items()}
+    # A train that follows the reference from another train's slot is far off.
+    return {**_within(2.0 * error, tables), "train_type": types}
+
+
+def on_a_line(tables: stated.Tables, band: dict[str, float]) -> dict[str, Any]:
+    """Tables of its row in `trainctl compare capacity`."""
+    return _within(0.5 * tables["topology"]["spacing_m"], tables)
+
+
+def _within(far: float, tables: stated.Tables) -> dict[str, Any]:
+    """Tables of a law that bounds the errors at ``far`` [m]."""
+    own = {"leader_error_lower_m": -far, "leader_error_upper_m": far, "head_l1_per_s": min(0.01, 0.5 * 50.0 / far)}
+    return {
+        "controller": {**tables["controller"], **own}, "plant": {"kind": "actuated_units"}, "observer": {"kind": "asymptotic"},
+        "run": {**tables["run"], "sub_step_s": 0.01},
+    }  # fmt: skip

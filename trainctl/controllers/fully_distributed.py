@@ -40,16 +40,33 @@ References
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numba import njit
 from pydantic import Field
 
-from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, Reference, Scene, Table, Trains, leader_at
+from trainctl.controllers import stated
+from trainctl.davis import resistance, resistance_of
+from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, Reference, SampledLaw, Scene, Table, Trains, leader_at
+
+if TYPE_CHECKING:
+    from trainctl.controllers import fully_distributed
+
+    module: SampledLaw = fully_distributed
 
 CLOCK: Literal["sampled"] = "sampled"
+
+#: Assumption 2.4 asks for room of the input in the whole band of speeds: the control period must not be too short.
+BANDED = True
+
+#: Figures -> their numbers in the paper.
+FIGURES = {"positions": "fig3", "spacing": "fig4", "speeds": "fig5", "inputs": "fig6"}
+
+#: Rows of a comparison -> the keys of [controller] that make them.
+COMPARED: dict[str, dict[str, Any]] = {"fully_distributed": {}}
 
 #: A start on a bound is inside; sums of positions are good to about 1e-9.
 ROUNDING = 1e-6
@@ -134,15 +151,15 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
     n = len(own.speed)
     acceleration, saturated = np.empty(n), np.empty(n, dtype=bool)
     z, speed = message(constants, own, leader)[:, 0].copy(), np.ascontiguousarray(own.speed)
-    resistance, came = np.ascontiguousarray(own.resistance), np.ascontiguousarray(heard[:, 0])
+    believed, came = np.ascontiguousarray(own.resistance), np.ascontiguousarray(heard[:, 0])
     wanted = np.ascontiguousarray(np.broadcast_to(leader[SPEED], n))  # formations that come and go have references of their own
-    _admitted(constants, z, speed, resistance, came, wanted, links, acceleration, saturated)
+    _admitted(constants, z, speed, believed, came, wanted, links, acceleration, saturated)
     return Demand(acceleration, saturated)
 
 
 @njit(cache=True, error_model="numpy")
 def _admitted(
-    constants: Constants, z: Floats, speed: Floats, resistance: Floats, heard: Floats, reference: Floats, links: Links,
+    constants: Constants, z: Floats, speed: Floats, believed: Floats, heard: Floats, reference: Floats, links: Links,
     acceleration: Floats, saturated: Bools,
 ) -> None:  # fmt: skip
     """Write what (10) to (12) give every train. ``np.minimum`` and ``np.maximum`` pass on what is not a number."""
@@ -165,10 +182,10 @@ def _admitted(
         v, v_r = speed[i], reference[i]
         beta, Beta = (c.rho[i] - v_r) * T, (c.Rho[i] - v_r) * T
         if c.own_speed:
-            least = greatest = resistance[i]
+            least = greatest = believed[i]
             if c.held:  # the input is acceleration plus resistance, and the latter changes while the former is held
-                now = c.davis[i, 0] + c.davis[i, 1] * v + c.davis[i, 2] * (v * v)
-                least, greatest = resistance[i] + (c.f[i] - now), resistance[i] + (c.F[i] - now)
+                now = resistance_of(i, v, c.davis)
+                least, greatest = believed[i] + (c.f[i] - now), believed[i] + (c.F[i] - now)
             vbar = v - v_r
             eta, Eta = vbar * T + (c.mu[i] - least) * (T * T), vbar * T + (c.Mu[i] - greatest) * (T * T)
         else:
@@ -182,13 +199,9 @@ def _admitted(
         acceleration[i] = (v_r + s / T - v) / T
 
 
-def _resistance(v: Floats, davis: Floats) -> Floats:
-    return davis[:, 0] + davis[:, 1] * v + davis[:, 2] * v**2
-
-
 def _resistance_range(davis: Floats, rho: Floats, Rho: Floats) -> tuple[Floats, Floats]:
     """Least and greatest resistance on [rho, Rho], (n,) each. No coefficient is negative, so it grows with the speed."""
-    return _resistance(rho, davis), _resistance(Rho, davis)
+    return resistance(rho, davis), resistance(Rho, davis)
 
 
 # What must hold before the law may be used
@@ -366,3 +379,25 @@ def _start_violations(scene: Scene) -> Iterator[str]:
                 yield f"{_name(scene, row)}.lower_m = {links.lower[row]:.10g}: spacing {when} is {spacing:.10g} m, too small"
             if spacing > links.upper[row] + ROUNDING:
                 yield f"{_name(scene, row)}.upper_m = {links.upper[row]:.10g}: spacing {when} is {spacing:.10g} m, too large"
+
+
+# In comparisons
+
+
+def alternative(tables: stated.Tables) -> dict[str, Any]:
+    """Tables that put this law in front of the traffic of another."""
+    run = tables["run"]
+    return {
+        "controller": {**tables["controller"], "eta": "own_speed"},
+        "run": {**run, "control_period_s": stated.periods(run, 8.0)},
+    }
+
+
+def on_a_line(tables: stated.Tables, band: dict[str, float]) -> dict[str, Any]:
+    """Tables of its row in `trainctl compare capacity`."""
+    period = 10.0  # what is left of 8 MW at this speed must do for a move within the band: Assumption 2.4
+    run, duration = tables["run"], math.ceil(tables["run"]["duration_s"] / period) * period
+    return {
+        "controller": {**tables["controller"], "eta": "own_speed"}, "bounds": band,
+        "run": {**run, "control_period_s": period, "duration_s": duration},
+    }  # fmt: skip

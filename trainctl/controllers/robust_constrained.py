@@ -33,20 +33,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from pydantic import Field
 from scipy.sparse import csgraph
 
-from trainctl.controllers import robust_gain, robust_theory
+from trainctl.controllers import robust_gain, robust_theory, stated
 from trainctl.errors import InputError
-from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, Scene, Table, Trains, restrict
+from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, SampledLaw, Scene, Table, Trains, restrict
+
+if TYPE_CHECKING:
+    from trainctl.controllers import robust_constrained
+
+    module: SampledLaw = robust_constrained
 
 CLOCK: Literal["sampled"] = "sampled"
 
 #: The model clamps speed and input, so a point plant must have the scenario's bounds as its clamps.
 CLAMPED = True
+
+#: Figures -> their numbers in the paper.
+FIGURES = {"positions": "fig2", "speeds_and_inputs": "fig3", "spacing": "fig4", "spacing_errors": "fig5"}
+
+#: Rows of a comparison -> the keys of [controller] that make them.
+COMPARED: dict[str, dict[str, Any]] = {"robust_constrained": {"h_per_s": 0.3}}
 
 #: Assumption 1: the input must exceed this many times the running resistance.
 KAPPA = 10.0
@@ -334,3 +345,17 @@ def _speeds(scene: Scene) -> Floats:
 
 def _some(words: Sequence[str], between: str = "; ") -> str:
     return between.join(words[:MOST]) + (f"{between}and {len(words) - MOST} more" if len(words) > MOST else "")
+
+
+# In comparisons
+
+
+def alternative(tables: stated.Tables) -> dict[str, Any]:
+    """Tables that put this law in front of the traffic of another."""
+    run = {**tables["run"], "control_period_s": stated.periods(tables["run"], 1.0)}
+    return {"run": run, "topology": {**tables["topology"], "weight": 0.01}}
+
+
+def on_a_line(tables: stated.Tables, band: dict[str, float]) -> dict[str, Any]:
+    """Tables of its row in `trainctl compare capacity`."""
+    return {**alternative(tables), "bounds": band}

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import coo_array, csgraph
 
+from trainctl.davis import resistance
 from trainctl.signals import Floats, Ints, Links, Scene, leader_at
 
 #: Largest formation with a bound for every pair; beyond, only linked pairs and the ends have one.
@@ -52,9 +53,7 @@ def heads(scene: Scene) -> Floats:
 
 def train_resistance(scene: Scene, speed: Floats) -> Floats:
     """Resistance of every train at these speeds, the mean of its units weighted by mass [m/s2], shape (n,)."""
-    c = scene.consists
-    davis = np.add.reduceat(c.mass[:, None] * c.davis, c.first[:-1]) / c.train_mass()[:, None]
-    return np.asarray(davis[:, 0] + davis[:, 1] * speed + davis[:, 2] * speed**2)
+    return resistance(speed, scene.consists.train_davis())
 
 
 def greatest_resistance(scene: Scene) -> Floats:

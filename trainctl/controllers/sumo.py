@@ -20,9 +20,8 @@ from trainctl.signals import Scene, Table
 
 CLOCK: Literal["none"] = "none"
 
-#: Whatever the scenario's plant is, it does not move these trains.
-PLANTS = ("point", "coupled_units", "actuated_units")
-OBSERVERS = ("none", "asymptotic", "intermediate")
+#: Rows of a comparison -> the keys of [controller] that make them.
+COMPARED: dict[str, dict[str, Any]] = {"sumo_fixed_block": {"block": "fixed"}, "sumo_moving_block": {"block": "moving"}}
 
 #: Distance of signals where neither the scenario nor its line states one [m].
 SIGNALS_M = 2000.0

@@ -15,9 +15,10 @@ from matplotlib.figure import Figure
 from trainctl.errors import InputError
 from trainctl.figures import style, trains, units
 from trainctl.figures.trains import Drawn, comparison, prepare
+from trainctl.laws import shipped
 from trainctl.runs.run import Run
 
-__all__ = ["FIGURES", "PAPER", "applicable", "comparison", "figure", "plot"]
+__all__ = ["FIGURES", "applicable", "comparison", "figure", "plot"]
 
 FORMATS = ("png", "svg", "pdf")
 
@@ -44,30 +45,16 @@ FIGURES: dict[str, Callable[[Drawn], Figure]] = {
     "acceleration_estimates": units.estimates("acceleration", r"acceleration [m/s$^2$]"),
 }
 
-#: law -> figure -> its number in the paper.
-PAPER: dict[str, dict[str, str]] = {
-    "fully_distributed": {"positions": "fig3", "spacing": "fig4", "speeds": "fig5", "inputs": "fig6"},
-    "emu_finite_time": {"unit_speeds": "fig3", "speed_over_position": "fig4", "couplers": "fig5", "gaps": "fig6"},
-    "robust_constrained": {"positions": "fig2", "speeds_and_inputs": "fig3", "spacing": "fig4", "spacing_errors": "fig5"},
-    "fault_tolerant": {
-        "fault_estimates": "fig2", "acceleration_estimates": "fig3", "position_differences": "fig4", "speed_differences": "fig5",
-        "unit_positions": "fig6", "unit_speeds": "fig7", "unit_forces": "fig8",
-    },
-}  # fmt: skip
-
 GENERIC = ("train_graph", "positions", "spacing", "spacing_errors", "speeds", "inputs")
 OF_UNITS = ("couplers", "coupler_forces", "unit_forces")
 
 
 def applicable(drawn: Drawn) -> dict[str, str]:
     """Figures of a run -> their file names without ending."""
-    law = drawn.known.law
-    numbered = dict(PAPER.get(law, {}))
-    if law == "emu_finite_time" and drawn.known.controller.get("alpha_1") == 1.0:
-        numbered = {"unit_speeds": "fig7_ordinary_consensus"}
-    if law == "fault_tolerant" and drawn.known.observer == "intermediate":
-        numbered = {"unit_differences": "fig9_intermediate_estimator"}
-    wanted = [*numbered, *(name for name in (*GENERIC, *OF_UNITS, *PAPER.get(law, {})) if name not in numbered)]
+    law = shipped(drawn.known.law)
+    paper: dict[str, str] = getattr(law, "FIGURES", {})
+    numbered = law.numbered(drawn.known.controller, drawn.known.observer) if hasattr(law, "numbered") else paper
+    wanted = [*numbered, *(name for name in (*GENERIC, *OF_UNITS, *paper) if name not in numbered)]
     if "speeds_and_inputs" in numbered:
         wanted = [name for name in wanted if name not in ("speeds", "inputs")]
     names = {}

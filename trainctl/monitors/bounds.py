@@ -51,7 +51,7 @@ class Alarms:
         self.p = p
         self.watch = on_track.of(p)
         self.waiting = Waiting(p.scenario.ids, p.line.edges, p.driving.wait_limit_s)
-        units = p.scenario.plant.kind != "point"
+        units = p.plant.UNITS
         self.watched: tuple[str, ...] = tuple(getattr(p.law, "WATCHED", ())) if units and not p.sampled else ()
         self.energy = energy.Balance(p) if units else None
 
@@ -92,9 +92,8 @@ class Alarms:
         s : State
             Updated.
         """
-        bounds = getattr(self.p.law, "watched_bounds", None)
-        if self.watched and bounds is not None:
-            s.now[:] = np.stack(bounds(self.p.params, scene))
+        if self.watched:
+            s.now[:] = np.stack(self.p.law.watched_bounds(self.p.params, scene))
             if not self.p.placed:
                 alone = np.bincount(scene.links.receiver, minlength=len(formation)) == 0
                 s.now[0, alone], s.now[1, alone] = -np.inf, np.inf

@@ -31,13 +31,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
+from trainctl.davis import running_resistance
 from trainctl.kernels import inlined
-from trainctl.signals import POSITION, SPEED, Consists, Floats, Ints, Scene, Table
+from trainctl.signals import POSITION, SPEED, Consists, Floats, Ints, Observer, Scene, Table
+
+if TYPE_CHECKING:
+    from trainctl.observers import asymptotic
+
+    module: Observer = asymptotic
 
 WIDTH = 6  # with one sinusoid; see width()
 CORRECTIONS = 5
@@ -262,6 +268,11 @@ def fault_estimate(constants: Constants, estimate: Floats) -> Floats:
     return total
 
 
+def acceleration_estimate(constants: Constants, estimate: Floats) -> Floats:
+    """Estimated acceleration of every unit [m/s2], for logs."""
+    return estimate[:, W]
+
+
 @inlined(inline="always")
 def own_coefficient(unit: Floats, v: float) -> float:
     """B1 of eq. (4): how the acceleration of a unit damps itself at this speed [1/s]."""
@@ -282,6 +293,6 @@ def static_force(i: int, train: Train, own: Floats, out: Floats) -> None:
             dv = v - own[j + 1, SPEED]
             rear = unit[STIFFNESS] * (own[j, POSITION] - own[j + 1, POSITION] - unit[LENGTH]) + unit[DAMPING] * dv
             rear_closing = unit[STIFFNESS] * dv
-        resistance = unit[C0] + (unit[C1] + unit[C2] * v) * v if v > 0.0 else 0.0
+        resistance = running_resistance(v, unit[C0], unit[C1], unit[C2])
         out[j, STATIC] = rear - stretched + unit[MASS] * resistance + (rear_closing - closing) / unit[RATE]
         stretched, closing = rear, rear_closing

@@ -20,7 +20,7 @@ References
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -44,7 +44,12 @@ from trainctl.observers.asymptotic import (
     static_force,
     train_of,
 )
-from trainctl.signals import POSITION, SPEED, Floats, Scene, Table
+from trainctl.signals import POSITION, SPEED, Floats, Observer, Scene, Table
+
+if TYPE_CHECKING:
+    from trainctl.observers import intermediate
+
+    module: Observer = intermediate
 
 WIDTH = 4
 CORRECTIONS = 5
@@ -148,3 +153,8 @@ def rate(i: int, constants: Constants, own: Floats, estimate: Floats, correction
 def fault_estimate(constants: Constants, estimate: Floats) -> Floats:
     """f'_hat of every unit [m/s3], for logs."""
     return estimate[:, XI] + constants.kappa * estimate[:, W]
+
+
+def acceleration_estimate(constants: Constants, estimate: Floats) -> Floats:
+    """Estimated acceleration of every unit [m/s2], for logs."""
+    return estimate[:, W]

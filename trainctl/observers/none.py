@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from trainctl.kernels import inlined
-from trainctl.signals import Floats, Scene, Table
+from trainctl.signals import Floats, Observer, Scene, Table
+
+if TYPE_CHECKING:
+    from trainctl.observers import none
+
+    module: Observer = none
 
 CORRECTIONS = 0
 
@@ -50,3 +55,13 @@ def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out:
 @inlined()
 def rate(i: int, constants: Constants, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats) -> None:
     """Nothing to estimate."""
+
+
+def fault_estimate(constants: Constants, estimate: Floats) -> Floats:
+    """None known, shape (U,)."""
+    return np.full(len(estimate), np.nan)
+
+
+def acceleration_estimate(constants: Constants, estimate: Floats) -> Floats:
+    """None known, shape (U,)."""
+    return np.full(len(estimate), np.nan)

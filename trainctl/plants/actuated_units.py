@@ -25,11 +25,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
+from trainctl.davis import running_resistance
 from trainctl.kernels import inlined
 from trainctl.plants import coupled_units
 from trainctl.plants.coupled_units import (
@@ -49,14 +50,25 @@ from trainctl.plants.coupled_units import (
     TRACTION,
     TRACTION_POWER,
     available,
-    running_resistance,
     slope_at,
 )
+from trainctl.plants.coupled_units import lead as lead
+from trainctl.plants.coupled_units import room as room
+from trainctl.plants.coupled_units import sure_braking as sure_braking
 from trainctl.plants.faults import Fault, Faults, effectiveness, fault_rate, tabulated
 from trainctl.plants.faults import violations as fault_violations
-from trainctl.signals import FORCE, GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Scene
+from trainctl.signals import FORCE, GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Reliance, Scene, UnitPlant
 
-STATES = 3
+if TYPE_CHECKING:
+    from trainctl.plants import actuated_units
+
+    module: UnitPlant = actuated_units
+
+UNITS, STATES = True, 3
+COLUMNS: tuple[str, ...] = (
+    "law_input", "fault_mps3", "fault_estimate_mps3", "acceleration_mps2", "acceleration_estimate_mps2",
+)  # fmt: skip
+CLAMPS: tuple[str, ...] = ()
 
 #: Columns of ``Constants.units`` behind those of ``coupled_units``: actuator rate [1/s], noise in the jerk [m/s3].
 RATE, NOISE = SLOPE + 1, SLOPE + 2
@@ -85,7 +97,7 @@ class Constants(NamedTuple):
 
 def violations(params: Params, scene: Scene, faults: Sequence[Fault] = ()) -> list[str]:
     """Every rule about this plant that fails."""
-    found = [*coupled_units.violations(params, scene), *fault_violations(faults, scene.trains, scene.consists)]
+    found = [*coupled_units.too_stiff(params, scene), *fault_violations(faults, scene.trains, scene.consists)]
     first, rate = scene.consists.first, scene.consists.actuator_rate
     for i, train in enumerate(scene.trains):
         least = rate[first[i] : first[i + 1]].min()
@@ -154,6 +166,16 @@ def noise(params: Params, seed: int, sample: int, units: int) -> Floats:
     """
     draw = np.random.Generator(np.random.Philox(key=seed, counter=[sample, 0, 0, 0])).standard_normal(units)
     return math.sqrt(params.noise_variance_m2_per_s6) * draw
+
+
+def noise_hold(params: Params) -> float | None:
+    """Time one sample of the noise is held [s]; None without noise."""
+    return params.noise_hold_s if params.noise_variance_m2_per_s6 > 0.0 else None
+
+
+def make_noise(params: Params, constants: Constants, seed: int, sample: int | None) -> None:
+    """Overwrite the column ``NOISE`` with the sample of that number, or with none."""
+    constants.units[:, NOISE] = 0.0 if sample is None else noise(params, seed, sample, len(constants.units))
 
 
 def balanced(own: Floats, consists: Consists, gradient: Floats | None = None) -> Floats:
@@ -254,3 +276,28 @@ def fault(constants: Constants, t: float, applied: Floats) -> Floats:
         lost = (1.0 - effectiveness(constants.faults, u, t)) * unit[RATE] * applied[u]
         out[u] = (fault_rate(constants.faults, u, t, t) - lost) / unit[INERTIA]
     return out
+
+
+def columns(
+    constants: Constants, t: float, own: Floats, applied: Floats, fault_estimate: Floats, acceleration_estimate: Floats
+) -> tuple[Floats, ...]:
+    """Values of ``COLUMNS`` at ``t``, (U,) each."""
+    out, power = np.empty_like(own), np.empty(6)
+    for i in range(len(constants.first) - 1):
+        rows = slice(constants.first[i], constants.first[i + 1])
+        rate(i, constants, t, t, own[rows], applied[rows], out[rows], power)
+    return applied, fault(constants, t, applied), fault_estimate, out[:, SPEED], acceleration_estimate
+
+
+def relied_on(
+    params: Params, consists: Consists, faults: Sequence[Fault], trains: Sequence[str], braking: float, top: Floats, fall: Floats,
+    deviations: float,
+) -> Reliance:  # fmt: skip
+    """As ``signals.Plant`` says: what coupled units give comes late, and noise comes on top."""
+    found = coupled_units.relied_on(params, consists, faults, trains, braking, top, fall, deviations)
+    davis, lag = consists.train_davis(), np.maximum.reduceat(1.0 / consists.actuator_rate, consists.first[:-1])
+    # Resistance falls as the train slows down, and the actuators follow late.
+    late = lag * braking * (davis[:, 1] + 2.0 * davis[:, 2] * top)
+    keeps = np.exp(-params.noise_hold_s / lag)
+    noise = deviations * math.sqrt(params.noise_variance_m2_per_s6) * lag * np.sqrt((1.0 - keeps) / (1.0 + keeps))
+    return found._replace(late=late, noise=noise, lag=lag)

@@ -18,15 +18,27 @@ there and no unit is driven backwards, as if its brakes held it. A train therefo
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
+from trainctl.davis import resistance, running_resistance
 from trainctl.kernels import inlined
-from trainctl.signals import GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Scene, Table
+from trainctl.plants import faults as actuators
+from trainctl.plants.faults import Fault
+from trainctl.signals import GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Reliance, Scene, Table, UnitPlant
 
-STATES = 2
+if TYPE_CHECKING:
+    from trainctl.plants import coupled_units
+
+    module: UnitPlant = coupled_units
+
+UNITS, STATES = True, 2
+COLUMNS: tuple[str, ...] = ()
+CLAMPS: tuple[str, ...] = ()
 
 #: Columns of ``Constants.units``; PER_INERTIA is 1 / INERTIA, since divisions took half the time of ``rate``.
 MASS, INERTIA, PER_INERTIA, C0, C1, C2, LENGTH, STIFFNESS, DAMPING = range(9)
@@ -47,8 +59,13 @@ class Params(Table):
     )
 
 
-def violations(params: Params, scene: Scene) -> list[str]:
-    """Every rule about this plant that fails: what the active part of couplers asks of the integrator.
+def violations(params: Params, scene: Scene, faults: Sequence[Fault] = ()) -> list[str]:
+    """Every rule about this plant that fails; it has no actuators that fail."""
+    return [*actuators.refused("coupled_units", faults), *too_stiff(params, scene)]
+
+
+def too_stiff(params: Params, scene: Scene) -> list[str]:
+    """What the active part of couplers asks of the integrator.
 
     The relative motion of the units of a train of equal ones has modes ``s**2 + a (d s + k) = 0`` with ``0 < a < 4``; classic
     Runge-Kutta steps of ``h`` keep ``4 d h`` and ``2 sqrt(k) h`` below 2.78, here 2.5.
@@ -69,8 +86,9 @@ class Constants(NamedTuple):
 
 
 def constants(
-    params: Params, consists: Consists, gradient: Floats | None = None, resistance_factor: Floats | None = None
-) -> Constants:
+    params: Params, consists: Consists, gradient: Floats | None = None, resistance_factor: Floats | None = None,
+    faults: Sequence[Fault] = (), trains: Sequence[str] = (),
+) -> Constants:  # fmt: skip
     """Pack the constants of all units into one table.
 
     Parameters
@@ -83,6 +101,8 @@ def constants(
         Position where a slope begins [m], ascending, and its rise / run; flat if left out.
     resistance_factor : ndarray, shape (U,), optional
         True running resistance over the nominal one; 1 if left out.
+    faults, trains
+        Nothing here fails.
 
     Returns
     -------
@@ -99,12 +119,6 @@ def constants(
     ])  # fmt: skip
     slopes = np.zeros((0, 2)) if gradient is None else np.ascontiguousarray(gradient, dtype=np.float64)
     return Constants(consists.first, np.ascontiguousarray(units, dtype=np.float64), slopes)
-
-
-@inlined(inline="always")
-def running_resistance(v: float, c0: float, c1: float, c2: float) -> float:
-    """Specific running resistance [N/kg], Davis form: eq. (3), but zero at standstill."""
-    return c0 + (c1 + c2 * v) * v if v > 0.0 else 0.0
 
 
 @inlined()
@@ -205,3 +219,94 @@ def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, app
     power[3] = damping
     power[4] = climb
     power[5] = disturbance
+
+
+# What trains of units say of themselves
+
+
+def lead(steps: int) -> float:
+    """Theta: under a held acceleration the head moves exactly ``v T + a T**2 / 2``, however long it is held."""
+    return 0.5
+
+
+def balanced(own: Floats, consists: Consists, gradient: Floats | None = None) -> Floats:
+    """Forces are no state here."""
+    return own
+
+
+def noise_hold(params: Params) -> None:
+    """No noise of its own."""
+    return
+
+
+def make_noise(params: Params, constants: Constants, seed: int, sample: int | None) -> None:
+    """No noise of its own."""
+
+
+def columns(
+    constants: Constants, t: float, own: Floats, applied: Floats, fault_estimate: Floats, acceleration_estimate: Floats
+) -> tuple[Floats, ...]:
+    """Nothing but what every plant of units has."""
+    return ()
+
+
+def room(consists: Consists, lower: Floats, upper: Floats) -> tuple[Floats, Floats]:
+    """Input that every unit of a train can always give in a speed band, whatever the speed: mu and Mu of Assumption 2.4.
+
+    Parameters
+    ----------
+    consists : Consists
+        Units of all trains.
+    lower, upper : ndarray, shape (n,)
+        Speed band of each train, rho and Rho [m/s].
+
+    Returns
+    -------
+    tuple of ndarray, each of shape (n,)
+        Lower and upper bound of the input, acceleration plus the train's mean running resistance [m/s2]; infinite where the speed
+        is unbounded, since nothing follows then.
+
+    Notes
+    -----
+    Each unit carries its own mass's share, so the unit weakest per mass decides, traction at the speed where power leaves
+    least. Where rotating mass or Davis coefficients differ between units, their share of the input does too: it is taken at
+    161 speeds of the band.
+    """
+    low, high = np.full(len(lower), -np.inf), np.full(len(lower), np.inf)
+    for i, (a, b) in enumerate(pairwise(consists.first)):
+        if not np.isfinite([lower[i], upper[i]]).all():
+            continue
+        speeds = np.linspace(max(lower[i], 0.0), upper[i], 161)[:, None]
+        m, rotating = consists.mass[a:b], consists.rotating[a:b]
+        r = resistance(speeds, consists.davis[a:b])
+        mean = (r @ m / m.sum())[:, None]
+        with np.errstate(divide="ignore"):
+            traction = np.minimum(consists.traction[a:b], consists.traction_power[a:b] / speeds) / m
+            braking = np.minimum(consists.braking[a:b], consists.braking_power[a:b] / speeds) / m
+        high[i] = ((traction - r) / rotating + mean).min()
+        low[i] = ((-braking - r) / rotating + mean).max()
+    return low, high
+
+
+def sure_braking(params: Any, consists: Consists, top: Floats) -> Floats:
+    """Deceleration every train can give on the level at any speed up to ``top`` (n,) [m/s2], shape (n,)."""
+    least, _ = room(consists, np.zeros_like(top), top)
+    return -least
+
+
+def relied_on(
+    params: Params, consists: Consists, faults: Sequence[Fault], trains: Sequence[str], braking: float, top: Floats, fall: Floats,
+    deviations: float,
+) -> Reliance:  # fmt: skip
+    """As ``signals.Plant`` says: units act at once, each as far as its own brakes and faults let it."""
+    share, bias = actuators.shares(faults, trains, consists)
+    units, heads = np.diff(consists.first), consists.first[:-1]
+    inertia = consists.mass * consists.rotating
+    total = np.add.reduceat(inertia, heads)
+    fastest = np.maximum(np.repeat(top, units), 1e-9)
+    force = np.minimum(consists.braking, consists.braking_power / fastest)
+    down, weight = np.repeat(fall, units), np.add.reduceat(consists.mass, heads)
+    given = np.add.reduceat(share * np.minimum(force, inertia * braking + consists.mass * down), heads) - weight * fall
+    pull = np.add.reduceat(share * np.minimum(consists.traction, consists.traction_power / fastest), heads) / consists.train_mass()
+    zero = np.zeros(len(top))
+    return Reliance(given / total, pull, np.add.reduceat(bias, heads) / total, zero, zero, zero)

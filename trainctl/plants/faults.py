@@ -95,6 +95,23 @@ def violations(faults: Sequence[Fault], trains: Sequence[str], consists: Consist
     return found
 
 
+def refused(plant: str, faults: Sequence[Fault]) -> list[str]:
+    """Return what a plant without actuators says of faults."""
+    return [f"fault: the plant {plant} has no actuators that fail; actuated_units has"] if faults else []
+
+
+def shares(faults: Sequence[Fault], trains: Sequence[str], consists: Consists) -> tuple[Floats, Floats]:
+    """Share of the demanded force every unit surely gives, and the greatest bias of its force [N], shape (U,)."""
+    share, bias = np.ones(len(consists.mass)), np.zeros(len(consists.mass))
+    for fault in faults:
+        u = int(consists.first[trains.index(fault.train)]) + fault.unit - 1
+        if fault.kind == "effectiveness":
+            share[u] *= fault.effectiveness or 0.0
+        else:
+            bias[u] += abs(fault.amplitude_n_per_s or 0.0) / consists.actuator_rate[u]
+    return share, bias
+
+
 def breaks(faults: Sequence[Fault]) -> Floats:
     """Ascending times [s] where a fault begins or ends: the integrator splits its steps there."""
     edges = {edge for fault in faults for edge in (fault.start_s, fault.end)}

@@ -10,13 +10,27 @@ admissible inputs and speeds, T step.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numba import njit
 from pydantic import Field, ValidationInfo, field_validator
 
-from trainctl.signals import GRAVITY, POSITION, SPEED, Bools, Consists, Floats, Table
+from trainctl.davis import resistance as resistance
+from trainctl.davis import resistance_of
+from trainctl.plants import faults as actuators
+from trainctl.plants.faults import Fault
+from trainctl.signals import GRAVITY, POSITION, SPEED, Bools, Consists, Floats, PointPlant, Reliance, Scene, Table
+
+if TYPE_CHECKING:
+    from trainctl.plants import point
+
+    module: PointPlant = point
+
+UNITS, STATES = False, 2
+COLUMNS: tuple[str, ...] = ()
+CLAMPS: tuple[str, ...] = ("input_lower_mps2", "input_upper_mps2", "speed_lower_mps", "speed_upper_mps")
 
 
 class Params(Table):
@@ -114,28 +128,6 @@ def constants(
     )
 
 
-def resistance(speed: Floats, davis: Floats) -> Floats:
-    """Specific running resistance, Davis form ``c0 + c1 v + c2 v^2``: f of fully_distributed (1), r of robust_constrained (2).
-
-    Parameters
-    ----------
-    speed : ndarray, shape (n,)
-        Forward positive [m/s].
-    davis : ndarray, shape (n, 3)
-        c0 [N/kg], c1 [N s/(m kg)], c2 [N s2/(m2 kg)].
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Decelerating force per mass [N/kg].
-
-    Notes
-    -----
-    As printed, so ``c0`` acts at standstill too, where the plant holds the train.
-    """
-    return davis[:, 0] + davis[:, 1] * speed + davis[:, 2] * speed**2
-
-
 def climbing(position: Floats, gradient: Floats) -> Floats:
     """Weight along the line per mass [N/kg], rising positive, of trains whose front is at ``position`` [m], shape (n,)."""
     if len(gradient) == 0:
@@ -152,6 +144,42 @@ def lead(steps: int) -> float:
     acceleration move ``v T_c + (1 - 1/m) / 2 (v(k+1) - v) T_c``.
     """
     return (1.0 - 1.0 / steps) / 2.0
+
+
+def violations(params: Params, scene: Scene, faults: Sequence[Fault] = ()) -> list[str]:
+    """Nothing but a fault can be wrong: points have no actuators."""
+    return actuators.refused("point", faults)
+
+
+def balanced(own: Floats, consists: Consists, gradient: Floats | None = None) -> Floats:
+    """Forces are no state of points."""
+    return own
+
+
+def noise_hold(params: Params) -> None:
+    """No noise of its own."""
+    return
+
+
+def room(consists: Consists, lower: Floats, upper: Floats) -> tuple[Floats, Floats]:
+    """Points give what the law asks for, up to the clamps, which are bounds already."""
+    return np.full(len(lower), -np.inf), np.full(len(lower), np.inf)
+
+
+def sure_braking(params: Params, consists: Consists, top: Floats) -> Floats:
+    """As much as the clamp leaves [m/s2], shape (n,), running resistance not counted on; infinite for free points."""
+    clamp = params.input_lower_mps2
+    return np.full(len(top), np.inf if clamp is None else -clamp)
+
+
+def relied_on(
+    params: Params, consists: Consists, faults: Sequence[Fault], trains: Sequence[str], braking: float, top: Floats, fall: Floats,
+    deviations: float,
+) -> Reliance:  # fmt: skip
+    """As ``signals.Plant`` says: points act at once."""
+    upper, zero = params.input_upper_mps2, np.zeros(len(top))
+    pull = np.full(len(top), np.inf if upper is None else upper)
+    return Reliance(np.minimum(braking, sure_braking(params, consists, top) - fall), pull, zero, zero, zero, zero)
 
 
 def advance(constants: Constants, own: Floats, acceleration: Floats, step: float, kick: Kick) -> Moved:
@@ -192,7 +220,7 @@ def _advance(constants: Constants, own: Floats, climb: Floats, acceleration: Flo
     c = constants
     for i in range(len(own)):
         v = own[i, SPEED]
-        believed = c.davis[i, 0] + c.davis[i, 1] * v + c.davis[i, 2] * (v * v)
+        believed = resistance_of(i, v, c.davis)
         asked = believed + climb[i] + acceleration[i] + kick.input[i]
         applied = np.minimum(np.maximum(asked, c.input_lower[i]), c.input_upper[i])
         free = v + applied * step - (c.resistance_factor[i] * believed + climb[i]) * step + kick.speed[i]

@@ -15,11 +15,11 @@ T           control period [s]
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
 
+from trainctl.davis import resistance, running_resistance
 from trainctl.kernels import inlined
 from trainctl.plants import coupled_units
 from trainctl.plants.coupled_units import (
@@ -35,7 +35,7 @@ from trainctl.plants.coupled_units import (
     TRACTION,
     TRACTION_POWER,
     available,
-    running_resistance,
+    room,
     slope_at,
 )
 from trainctl.signals import GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Links
@@ -129,44 +129,6 @@ def watch(i: int, constants: Constants, leader: Floats, first: Ints, own: Floats
     """Nothing to watch here."""
 
 
-def room(consists: Consists, lower: Floats, upper: Floats) -> tuple[Floats, Floats]:
-    """Input that every unit of a train can always give in a speed band, whatever the speed: mu and Mu of Assumption 2.4.
-
-    Parameters
-    ----------
-    consists : Consists
-        Units of all trains.
-    lower, upper : ndarray, shape (n,)
-        Speed band of each train, rho and Rho [m/s].
-
-    Returns
-    -------
-    tuple of ndarray, each of shape (n,)
-        Lower and upper bound of the input, acceleration plus the train's mean running resistance [m/s2]; infinite where the speed
-        is unbounded, since nothing follows then.
-
-    Notes
-    -----
-    Each unit carries its own mass's share, so the unit weakest per mass decides, traction at the speed where power leaves
-    least. Where rotating mass or Davis coefficients differ between units, their share of the input does too: it is taken at
-    161 speeds of the band.
-    """
-    low, high = np.full(len(lower), -np.inf), np.full(len(lower), np.inf)
-    for i, (a, b) in enumerate(pairwise(consists.first)):
-        if not np.isfinite([lower[i], upper[i]]).all():
-            continue
-        speeds = np.linspace(max(lower[i], 0.0), upper[i], 161)[:, None]
-        m, rotating = consists.mass[a:b], consists.rotating[a:b]
-        r = consists.davis[a:b, 0] + consists.davis[a:b, 1] * speeds + consists.davis[a:b, 2] * speeds**2
-        mean = (r @ m / m.sum())[:, None]
-        with np.errstate(divide="ignore"):
-            traction = np.minimum(consists.traction[a:b], consists.traction_power[a:b] / speeds) / m
-            braking = np.minimum(consists.braking[a:b], consists.braking_power[a:b] / speeds) / m
-        high[i] = ((traction - r) / rotating + mean).min()
-        low[i] = ((-braking - r) / rotating + mean).max()
-    return low, high
-
-
 def smallest_period(consists: Consists, speed: Floats, lower: Floats, upper: Floats) -> Floats:
     """Control period above which Assumption 2.4 of the fully distributed law holds with the units' own limits.
 
@@ -195,6 +157,6 @@ def smallest_period(consists: Consists, speed: Floats, lower: Floats, upper: Flo
 def mean_resistance(consists: Consists, speed: Floats) -> Floats:
     """Compute the running resistance per mass [N/kg] of whole trains at these speeds, shape (n,): eq. (3) weighted by mass."""
     v = np.repeat(speed, np.diff(consists.first))
-    r = consists.davis[:, 0] + consists.davis[:, 1] * v + consists.davis[:, 2] * v**2
+    r = resistance(v, consists.davis)
     total = np.add.reduceat(consists.mass * r, consists.first[:-1])
     return total / consists.train_mass()

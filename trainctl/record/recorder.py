@@ -31,6 +31,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import ArrayLike, NDArray
 
+from trainctl.record import columns
 from trainctl.record.folder import SCHEMA_VERSION, plain, remove
 from trainctl.signals import POWERS
 
@@ -43,10 +44,6 @@ SEGMENT_GROUPS = 16
 
 #: Optional columns of trains.parquet: energies [J] since the train's last row, one per entry of ``signals.POWERS``.
 ENERGIES = tuple(f"{power}_j" for power in POWERS)
-#: Optional columns of units.parquet, for the laws and plants that know them.
-UNIT_EXTRAS = (
-    "law_input", "fault_mps3", "fault_estimate_mps3", "acceleration_mps2", "acceleration_estimate_mps2",
-)  # fmt: skip
 
 _DTYPES = {"float": np.float64, "int": np.int32, "bool": np.bool_}
 
@@ -72,26 +69,22 @@ def standard_tables(
     watched : sequence of str
         The law's ``WATCHED``: each gives two columns of trains, ``<watched>_min`` and ``<watched>_max``.
     train_extras, unit_extras : sequence of str
-        Further columns of numbers: ``ENERGIES``, disturbances; any of ``UNIT_EXTRAS``.
+        Further columns of numbers: ``ENERGIES``, disturbances; the plant's ``COLUMNS``.
     """
     tables: dict[str, Columns] = {
         "trains": {
             "time_s": "float", "train": trains, "track": tracks, "edge": edges,
-            **_floats(("position_m", "speed_mps", "input_mps2", "spacing_m", "gap_m")), "saturated": "bool",
+            **_floats(columns.TRAINS), "saturated": "bool",
             **_floats(f"{name}_{end}" for name in watched for end in ("min", "max")),
             **_floats(train_extras),
         },
         "links": {
             "time_s": "float", "sender": trains, "receiver": trains,
-            **_floats(("spacing_m", "desired_m", "lower_m", "upper_m")), "heard": "bool",
+            **_floats(columns.LINKS), "heard": "bool",
         },
     }  # fmt: skip
     if units:
-        numbers = ("position_m", "speed_mps", "force_n", "coupler_m", "coupler_force_n")
-        extremes = ("coupler_min_m", "coupler_max_m", "force_min_n", "force_max_n")
-        tables["units"] = {
-            "time_s": "float", "train": trains, "unit": "int", **_floats((*numbers, *extremes, *unit_extras)),
-        }  # fmt: skip
+        tables["units"] = {"time_s": "float", "train": trains, "unit": "int", **_floats((*columns.UNITS, *unit_extras))}
     return tables
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
 from collections.abc import Sequence
@@ -16,16 +15,31 @@ from pydantic import ValidationError
 
 import sumo_net
 from sumo_net import Line, LineError, Rails
+from trainctl.davis import resistance
 from trainctl.errors import InputError
-from trainctl.laws import find_law, find_observer
-from trainctl.plants import actuated_units, disturbance, point, shared
+from trainctl.laws import find_law, find_observer, find_plant, unfit
+from trainctl.plants import disturbance
 from trainctl.railway import supervisor
 from trainctl.railway.authority import DRIVER_MARGIN_M
 from trainctl.scenario import placing, promise, roster
 from trainctl.scenario.reading import examine, mistakes, read
 from trainctl.scenario.reference import Profile
 from trainctl.scenario.tables import Scenario, Traffic
-from trainctl.signals import FORCE, POSITION, SPEED, Bounds, Consists, Floats, Ints, Links, Reference, Scene, leader_at, restrict
+from trainctl.signals import (
+    POSITION,
+    SPEED,
+    Bounds,
+    Consists,
+    Floats,
+    Ints,
+    Links,
+    Observer,
+    Plant,
+    Reference,
+    Scene,
+    leader_at,
+    restrict,
+)  # fmt: skip
 from trainctl.topology import convoys, graph
 from trainctl.topology.exchange import Radio
 
@@ -38,9 +52,9 @@ class Prepared:
     file: str
     law: Any
     params: Any
-    plant: Any
+    plant: Plant
     plant_params: Any
-    observer: Any
+    observer: Observer
     observer_params: Any
     consists: Consists
     own: Floats
@@ -81,8 +95,7 @@ class Prepared:
             known["greatest_mps2"] = float(max([stated.greatest_mps2, *pulls[np.isfinite(pulls)]]))
         if "emergency_mps2" not in stated.model_fields_set:
             v = self.fastest
-            resistance = np.sum(self.consists.train_davis() * np.column_stack([np.ones_like(v), v, v**2]), axis=1)
-            brakes = resistance - self.bounds.input_lower
+            brakes = resistance(v, self.consists.train_davis()) - self.bounds.input_lower
             wanted = math.ceil(1000.0 * max([stated.emergency_mps2, *brakes[np.isfinite(brakes)]])) / 1000.0
             known["emergency_mps2"] = min(wanted, float(np.floor(1000.0 * self.sure_braking.min())) / 1000.0)
             known["service_mps2"] = min(stated.service_mps2, known["emergency_mps2"])
@@ -98,12 +111,7 @@ class Prepared:
     @cached_property
     def sure_braking(self) -> Floats:
         """Deceleration every train can give on the level at any speed it may have [m/s2], shape (n,); infinite for free points."""
-        if self.scenario.plant.kind == "point":
-            clamp = self.plant_params.input_lower_mps2
-            return np.full(len(self.scenario.train), np.inf if clamp is None else -clamp)
-        top = promise.top_speed(self)
-        least, _ = shared.room(self.consists, np.zeros_like(top), top)
-        return -least
+        return self.plant.sure_braking(self.plant_params, self.consists, promise.top_speed(self))
 
     @cached_property
     def assumed(self) -> supervisor.Assumed:
@@ -123,12 +131,12 @@ class Prepared:
     @property
     def theta(self) -> float:
         """Lead of the plant: x(k+1) = x + ((1 - theta) v(k) + theta v(k+1)) T_c under a held acceleration."""
-        return point.lead(self.scenario.run.held_steps) if self.scenario.plant.kind == "point" else 0.5
+        return self.plant.lead(self.scenario.run.held_steps)
 
     @property
     def step_theta(self) -> float:
         """Lead of the plant over one step of the simulator, as the supervisor counts it."""
-        return 0.0 if self.scenario.plant.kind == "point" else 0.5
+        return self.plant.lead(1)
 
     @cached_property
     def driving(self) -> Traffic:
@@ -193,7 +201,7 @@ class Prepared:
         return Scene(
             trains=self.scenario.ids, consists=self.consists, own=own, links=links, bounds=self.bounds, reference=self.reference,
             time=time, step=run.step_s, control_period=run.control_period_s or run.step_s, lead=self.theta,
-            sub_step=run.step_s if self.scenario.plant.kind == "point" else run.step_s / run.sub_steps,
+            sub_step=run.step_s / run.sub_steps if self.plant.UNITS else run.step_s,
         )  # fmt: skip
 
     @cached_property
@@ -268,8 +276,8 @@ def prepare(
     params = attempt(_params, law.Params, scenario.controller.keys(), "controller") if law else None
     observer = attempt(find_observer, scenario.observer.kind)
     observer_params = attempt(_params, observer.Params, scenario.observer.keys(), "observer") if observer else None
-    plant = importlib.import_module(f"trainctl.plants.{scenario.plant.kind}")
-    plant_params = attempt(_params, plant.Params, scenario.plant.keys(), "plant")
+    plant: Plant | None = attempt(find_plant, scenario.plant.kind)
+    plant_params = attempt(_params, plant.Params, scenario.plant.keys(), "plant") if plant else None
     network: tuple[Line, Any, Path | None] | None
     if scenario.network.sumocfg is not None:
         anew = (scenario, *enrolled) if enrolled is not None else attempt(roster.enrol, scenario, folder)
@@ -282,14 +290,16 @@ def prepare(
     plan = attempt(_plan, scenario)
     misplaced = placing.on_the_line(scenario, network[0]) if network is not None and trains is None else []
     found += misplaced
-    if any(part is None for part in (law, params, observer, observer_params, plant_params, plan)):
+    if plant is not None and not plant.UNITS:
+        found += _many_units(scenario)
+    if plant is None or any(part is None for part in (law, params, observer, observer_params, plant_params, plan)):
         raise InputError([f"{file}: {line}" for line in found])
 
     consists = scenario.consists()
-    bounds = _bounds(scenario, consists)
+    bounds = _bounds(scenario, plant, consists)
     # Trains that come and go are checked as the one formation they could be.
     placed = scenario if trains is None else roster.in_formation(scenario, plan.slot)
-    own = _initial(placed, consists, getattr(plant, "STATES", 2))
+    own = _initial(placed, plant, consists)
     track = np.unique([t.track for t in placed.train], return_inverse=True)[1].astype(np.int64)
     start = own[0, POSITION] - scenario.topology.first_slot_m
     if scenario.reference.follow_line:
@@ -311,12 +321,12 @@ def prepare(
     if network is not None:
         prepared = replace(prepared, line=network[0], spec=network[1], net=network[2])
         slopes = np.column_stack([network[0].gradient.breaks, network[0].gradient.slope])
-        if slopes[:, 1].any() and own.shape[1] > FORCE:  # actuators hold their trains where they start
-            prepared = replace(prepared, own=actuated_units.balanced(own, consists, slopes))
+        if slopes[:, 1].any():  # actuators hold their trains where they start
+            prepared = replace(prepared, own=plant.balanced(own, consists, slopes))
         if trains is not None:
             n = len(scenario.train)
             nobody = graph.links(plan, np.arange(n), np.arange(n))  # everybody alone
-            start = _initial(scenario, consists, getattr(plant, "STATES", 2))
+            start = _initial(scenario, plant, consists)
             prepared = replace(prepared, own=start, first_links=nobody, roster=trains)
         elif law.CLOCK != "none":  # such trains leave at the line's end
             found += placing.long_enough(prepared)
@@ -418,34 +428,43 @@ def _exchange_period(scenario: Scenario) -> float:
     return scenario.topology.communication_period_s or run.control_period_s or run.step_s
 
 
-def _initial(scenario: Scenario, consists: Consists, states: int) -> Floats:
-    """State of all units at time 0: couplers at rest and one speed, unless the train says otherwise. Shape (U, states)."""
-    own = np.zeros((len(consists.length), states))
+def _initial(scenario: Scenario, plant: Plant, consists: Consists) -> Floats:
+    """State of all units at time 0: couplers at rest and one speed, unless the train says otherwise. Shape (U, STATES)."""
+    own = np.zeros((len(consists.length), 2))
     for i, t in enumerate(scenario.train):
         a, b = consists.first[i], consists.first[i + 1]
         back = np.concatenate([[0.0], np.cumsum(consists.length[a : b - 1] + np.asarray(t.coupler_m or 0.0))])
         own[a:b, POSITION] = t.position_m - back
         own[a:b, SPEED] = t.speed_mps if t.unit_speed_mps is None else t.unit_speed_mps
-    return actuated_units.balanced(own, consists) if states > FORCE else own
+    return plant.balanced(own, consists)
 
 
-def _bounds(scenario: Scenario, consists: Consists) -> Bounds:
+def _many_units(scenario: Scenario) -> list[str]:
+    """Types of trains that are no points."""
+    types = scenario.train_type
+    many = sorted({t.type for t in scenario.train if t.type in types and types[t.type].units > 1})
+    return [
+        f"train_type.{name}.units = {types[name].units}: the {scenario.plant.kind} plant has one unit per train" for name in many
+    ]
+
+
+def _bounds(scenario: Scenario, plant: Plant, consists: Consists) -> Bounds:
     """The scenario's bounds; where it states no input bounds, what the units can always give within the speed band."""
     bounds = scenario.bounds_of_trains()
-    least, greatest = _room(scenario, consists)
+    least, greatest = _room(scenario, plant, consists)
     return bounds._replace(
         input_lower=np.where(np.isfinite(bounds.input_lower), bounds.input_lower, least),
         input_upper=np.where(np.isfinite(bounds.input_upper), bounds.input_upper, greatest),
     )
 
 
-def _room(scenario: Scenario, consists: Consists) -> tuple[Floats, Floats]:
-    """Input the units can give anywhere in the speed band, infinite for points and where there is no band."""
+def _room(scenario: Scenario, plant: Plant, consists: Consists) -> tuple[Floats, Floats]:
+    """Input the trains can give anywhere in the speed band, infinite where there is no band."""
     bounds = scenario.bounds_of_trains()
     n = len(scenario.train)
-    if scenario.plant.kind == "point" or not np.all(np.isfinite(bounds.speed_lower) & np.isfinite(bounds.speed_upper)):
+    if not np.all(np.isfinite(bounds.speed_lower) & np.isfinite(bounds.speed_upper)):
         return np.full(n, -np.inf), np.full(n, np.inf)
-    return shared.room(consists, bounds.speed_lower, bounds.speed_upper)
+    return plant.room(consists, bounds.speed_lower, bounds.speed_upper)
 
 
 def _resolved(scenario: Scenario, bounds: Bounds) -> Scenario:
@@ -468,13 +487,9 @@ def _resolved(scenario: Scenario, bounds: Bounds) -> Scenario:
 
 def _fits(p: Prepared) -> list[str]:
     """Law, plant and observer that do not go together, bounds no train can keep, a line that is too short."""
-    found = []
-    plants = getattr(p.law, "PLANTS", ("point", "coupled_units") if p.sampled else ("coupled_units",))
-    if p.scenario.plant.kind not in plants:
-        found.append(f"plant.kind = {p.scenario.plant.kind}: law {p.scenario.controller.law} runs on {', '.join(plants)}")
-    known = getattr(p.law, "OBSERVERS", ("none",))
-    if p.scenario.observer.kind not in known:
-        found.append(f"observer.kind = {p.scenario.observer.kind}: law {p.scenario.controller.law} works with {', '.join(known)}")
+    found = (
+        [] if p.law.CLOCK == "none" else unfit(p.law, p.scenario.controller.law, p.scenario.plant.kind, p.scenario.observer.kind)
+    )
     for i, t in enumerate(p.scenario.train):
         for key, low, high in (
             ("speed", p.bounds.speed_lower[i], p.bounds.speed_upper[i]),
@@ -482,16 +497,16 @@ def _fits(p: Prepared) -> list[str]:
         ):
             if not low < high:
                 found.append(f"train[{t.id}]: {key} bounds {low:g} .. {high:g} are empty")
-    if getattr(p.law, "CLAMPED", False) and p.scenario.plant.kind == "point":
-        for key in type(p.plant_params).model_fields:
+    if getattr(p.law, "CLAMPED", False):
+        for key in p.plant.CLAMPS:
             clamp, bound = getattr(p.plant_params, key), getattr(p.scenario.bounds, key)
             if clamp != bound:
                 found.append(f"plant.{key} = {clamp}: must be [bounds] {key} = {bound}, this law's model clamps there")
     if p.law.CLOCK == "none":
         return found + list(p.law.unfit(p.scenario))
     found += [*_messages_fit(p), *_disturbances_fit(p)]
-    if p.scenario.plant.kind != "point" and p.sampled:
-        least, greatest = _room(p.scenario, p.consists)
+    if p.sampled:
+        least, greatest = _room(p.scenario, p.plant, p.consists)
         for i, t in enumerate(p.scenario.train):
             if p.bounds.input_lower[i] < least[i] - 1e-12:
                 found.append(
@@ -538,14 +553,9 @@ def _disturbances_fit(p: Prepared) -> list[str]:
     for k, entry in enumerate(scenario.disturbance, 1):
         if entry.on == "measurement" and not p.sampled:
             found.append(f"disturbance[{k}].on = measurement: needs a sampled law; a continuous one has no instants to measure at")
-    if scenario.fault and scenario.plant.kind != "actuated_units":
-        found.append(f"fault: the plant {scenario.plant.kind} has no actuators that fail; actuated_units has")
-    if scenario.plant.kind == "coupled_units":
-        found += p.plant.violations(p.plant_params, p.first_scene)
-    if scenario.plant.kind == "actuated_units":
-        found += p.plant.violations(p.plant_params, p.first_scene, scenario.fault)
-        if p.plant_params.noise_variance_m2_per_s6 > 0 and scenario.run.seed is None:
-            found.append("run.seed: missing; the plant's noise is random")
+    found += p.plant.violations(p.plant_params, p.first_scene, scenario.fault)
+    if p.plant.noise_hold(p.plant_params) is not None and scenario.run.seed is None:
+        found.append("run.seed: missing; the plant's noise is random")
     return found
 
 

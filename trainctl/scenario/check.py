@@ -39,8 +39,8 @@ def facts(p: Prepared) -> dict[str, Any]:
     if p.sampled:
         found |= {"control_period_s": scene.control_period, "lead_theta": p.theta}
         if (
-            p.scenario.controller.law == "fully_distributed"
-            and p.scenario.plant.kind != "point"
+            getattr(p.law, "BANDED", False)
+            and p.plant.UNITS
             and np.all(np.isfinite(p.bounds.speed_lower) & np.isfinite(p.bounds.speed_upper))
         ):
             speed = np.full(len(p.scenario.ids), p.leader(0.0)[1])

@@ -12,14 +12,12 @@ e R         maximum error of the running resistance at the line's own speed [m/s
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from trainctl.davis import resistance
 from trainctl.plants import disturbance, shared
-from trainctl.plants.faults import Fault
 from trainctl.railway import along, authority, supervisor
 from trainctl.railway.supervisor import Assumed
 from trainctl.railway.ways import ways
@@ -42,6 +40,7 @@ class Parts(NamedTuple):
     fall: Floats  # m/s2, of gravity on the steepest descent of its route
     climb: Floats  # m/s2, on the steepest ascent
     given: Floats  # m/s2, what brakes and slope leave of full braking, with all faults
+    pull: Floats  # m/s2, greatest force per mass at its top speed
     input: Floats  # m/s2, w3, and a bias of faulty actuators
     speed: Floats  # m/s2, w2 / T
     resistance: Floats  # m/s2, e R
@@ -79,19 +78,6 @@ def _slopes(p: Prepared) -> tuple[Floats, Floats]:
     return down, up
 
 
-def _faulty(p: Prepared) -> tuple[Floats, Floats]:
-    """Share of the demanded force every unit surely gives, and the greatest bias of its force [N], shape (U,)."""
-    share, bias = np.ones(len(p.consists.mass)), np.zeros(len(p.consists.mass))
-    faults: Sequence[Fault] = p.scenario.fault
-    for fault in faults:
-        u = int(p.consists.first[p.scenario.ids.index(fault.train)]) + fault.unit - 1
-        if fault.kind == "effectiveness":
-            share[u] *= fault.effectiveness or 0.0
-        else:
-            bias[u] += abs(fault.amplitude_n_per_s or 0.0) / p.consists.actuator_rate[u]
-    return share, bias
-
-
 def parts(p: Prepared) -> Parts:
     """Numbers behind ``assume``, for every train of a scenario."""
     n, c, run, b = len(p.scenario.ids), p.consists, p.scenario.run, p.supervision.emergency_mps2
@@ -99,32 +85,14 @@ def parts(p: Prepared) -> Parts:
     greatest = np.zeros((len(disturbance.CHANNELS), n))
     for entry in p.scenario.disturbance:
         greatest += entry.greatest(p.scenario.ids, DEVIATIONS)
-    davis, zero = c.train_davis(), np.zeros(n)
-    resistance = greatest[disturbance.RESISTANCE] * (davis[:, 0] + davis[:, 1] * top + davis[:, 2] * top**2)
-    found = Parts(
-        top=top, fall=GRAVITY * down, climb=GRAVITY * up, given=np.full(n, b), input=greatest[disturbance.INPUT],
-        speed=greatest[disturbance.SPEED] / run.step_s, resistance=resistance, noise=zero,
-        position=greatest[disturbance.POSITION], measured=greatest[disturbance.MEASUREMENT], lag=zero,
+    error = greatest[disturbance.RESISTANCE] * resistance(top, c.train_davis())
+    fall = GRAVITY * down
+    sure = p.plant.relied_on(p.plant_params, c, p.scenario.fault, p.scenario.ids, b, top, fall, DEVIATIONS)
+    return Parts(
+        top=top, fall=fall, climb=GRAVITY * up, given=sure.braking, pull=sure.pull, input=greatest[disturbance.INPUT] + sure.bias,
+        speed=greatest[disturbance.SPEED] / run.step_s, resistance=error + sure.late, noise=sure.noise,
+        position=greatest[disturbance.POSITION], measured=greatest[disturbance.MEASUREMENT], lag=sure.lag,
     )  # fmt: skip
-    if p.scenario.plant.kind == "point":
-        return found._replace(given=np.minimum(b, p.sure_braking - found.fall))
-    share, bias = _faulty(p)
-    units, heads = np.diff(c.first), p.heads
-    inertia = c.mass * c.rotating
-    total = np.add.reduceat(inertia, heads)
-    force = np.minimum(c.braking, c.braking_power / np.maximum(np.repeat(top, units), 1e-9))
-    fall, weight = np.repeat(found.fall, units), np.add.reduceat(c.mass, heads)
-    given = np.add.reduceat(share * np.minimum(force, inertia * b + c.mass * fall), heads) - weight * found.fall
-    found = found._replace(given=given / total, input=found.input + np.add.reduceat(bias, heads) / total)
-    if p.scenario.plant.kind == "coupled_units":
-        return found
-    lag = np.maximum.reduceat(1.0 / c.actuator_rate, heads)
-    # Resistance falls as the train slows down, and the actuators follow late.
-    falling = lag * b * (davis[:, 1] + 2.0 * davis[:, 2] * top)
-    variance, hold = p.plant_params.noise_variance_m2_per_s6, p.plant_params.noise_hold_s
-    keeps = np.exp(-hold / lag)
-    noise = DEVIATIONS * math.sqrt(variance) * lag * np.sqrt((1.0 - keeps) / (1.0 + keeps))
-    return found._replace(lag=lag, noise=noise, resistance=found.resistance + falling)
 
 
 def _scatter(found: Parts) -> Floats:
@@ -136,15 +104,8 @@ def assume(p: Prepared) -> Assumed:
     """What the supervisor relies on of every train of a scenario; ``refusals`` says where that cannot be met."""
     found, rules, c = parts(p), p.supervision, p.consists
     scatter = _scatter(found)
-    share, _ = _faulty(p)
-    traction = np.minimum(c.traction, c.traction_power / np.maximum(np.repeat(found.top, np.diff(c.first)), 1e-9))
-    if p.scenario.plant.kind == "point":
-        upper = p.plant_params.input_upper_mps2
-        pull = np.full(len(scatter), np.inf if upper is None else upper)
-    else:
-        pull = np.add.reduceat(share * traction, p.heads) / p.consists.train_mass()
-    coasting = shared.mean_resistance(c, found.top) + found.resistance + found.climb - pull  # uphill it may slow down by itself
-    kicks = 0.0 if p.scenario.plant.kind == "point" else 0.5 * found.speed * p.scenario.run.step_s  # before it moves, not after
+    coasting = shared.mean_resistance(c, found.top) + found.resistance + found.climb - found.pull  # uphill it may slow by itself
+    kicks = p.step_theta * found.speed * p.scenario.run.step_s  # where they come before it moves, not after
     return Assumed(
         braking=np.maximum(np.minimum(found.given, rules.emergency_mps2) - scatter, LEAST_BRAKING),
         hardest=np.maximum(rules.emergency_mps2 + scatter, coasting),
@@ -173,7 +134,7 @@ def refusals(p: Prepared) -> list[str]:
     """What of the promise cannot be kept in a scenario with ``mode = "on"``, with the numbers that would do."""
     if p.supervision.mode != "on" or p.law.CLOCK == "none":
         return []
-    clamp = p.plant_params.speed_lower_mps if p.scenario.plant.kind == "point" else None
+    clamp = p.plant_params.speed_lower_mps if "speed_lower_mps" in p.plant.CLAMPS else None
     if clamp is not None and clamp > 0.0:
         return [
             f"plant.speed_lower_mps = {clamp:g}: trains that cannot stand cannot be kept apart; with supervisor.mode = on it must"
@@ -296,7 +257,7 @@ def told(p: Prepared) -> dict[str, Any]:
 
 def _unbounded(p: Prepared) -> bool:
     """Whether anything random has no bound, so that the promise holds with a probability only."""
-    noisy = p.scenario.plant.kind == "actuated_units" and p.plant_params.noise_variance_m2_per_s6 > 0.0
+    noisy = p.plant.noise_hold(p.plant_params) is not None
     return noisy or any(not np.isfinite(entry.greatest(p.scenario.ids)).all() for entry in p.scenario.disturbance)
 
 

@@ -200,8 +200,6 @@ def _types(scenario: Scenario, traffic: Traffic) -> tuple[dict[str, TrainType], 
                 found += kind
             else:
                 types[name] = kind
-        elif scenario.plant.kind == "point" and types[name].units > 1:
-            found.append(f"train_type.{name}.units = {types[name].units}: the point plant has one unit per train")
     return types, found
 
 

@@ -312,7 +312,7 @@ class Observer(Module):
 class Plant(Module):
     """[plant]: what moves the trains."""
 
-    kind: Literal["point", "coupled_units", "actuated_units"] = Field("point", description="Module in trainctl.plants.")
+    kind: str = Field("point", description="Module in trainctl.plants.")
 
 
 class Scenario(Table):
@@ -376,9 +376,6 @@ class Scenario(Table):
                 found.append(f"event[{k}].train = {event.train}: no such train; there are: {', '.join(ids)}")
         if self.topology.loss > 0 and self.run.seed is None:
             found.append(f"topology.loss = {self.topology.loss:g}: losses are random, so the run needs [run] seed")
-        if self.plant.kind == "point":
-            many = sorted({t.type for t in self.train if t.type in types and types[t.type].units > 1})
-            found += [f"train_type.{name}.units = {types[name].units}: the point plant has one unit per train" for name in many]
         return found
 
     def _of_the_network(self, resolved: bool) -> list[str]:

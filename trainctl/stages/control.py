@@ -19,7 +19,7 @@ class Control:
     def __init__(self, p: Prepared) -> None:
         self.p = p
         self.radio = p.radio
-        self.clamps = getattr(p.law, "CLAMPED", False) and p.scenario.plant.kind != "point"  # point trains clamp in the plant
+        self.clamps = getattr(p.law, "CLAMPED", False) and not p.plant.CLAMPS  # else the plant does
 
     def initial(self) -> Demand:
         """Nothing asked yet."""

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from trainctl.plants import actuated_units, coupled_units, faults, integrate, point, shared
+from trainctl.davis import resistance
+from trainctl.plants import coupled_units, faults, integrate, point, shared
 from trainctl.scenario.build import Prepared
 from trainctl.signals import (
     FORCE,
     GRAVITY,
     POSITION,
-    POWERS,
     SPEED,
     Demand,
     Disturbed,
@@ -24,7 +24,9 @@ from trainctl.signals import (
     Links,
     Messages,
     Motion,
+    PointPlant,
     Scene,
+    UnitPlant,
 )  # fmt: skip
 from trainctl.topology import exchange
 
@@ -55,7 +57,7 @@ class Moved(NamedTuple):
 
 def of(p: Prepared) -> Points | Units:
     """The plant of a scenario."""
-    return Points(p) if p.scenario.plant.kind == "point" else Units(p)
+    return Units(p) if p.plant.UNITS else Points(p)
 
 
 def _slopes(p: Prepared) -> Floats:
@@ -69,8 +71,9 @@ class Points:
 
     def __init__(self, p: Prepared) -> None:
         self.step_s = p.scenario.run.step_s
-        self.noisy = False
-        self.constants = point.constants(p.plant_params, p.consists, gradient=_slopes(p))
+        self.noisy = p.plant.noise_hold(p.plant_params) is not None
+        self.plant = cast(PointPlant, p.plant)
+        self.constants = self.plant.constants(p.plant_params, p.consists, gradient=_slopes(p))
 
     def initial(self) -> State:
         """Nothing to remember."""
@@ -78,10 +81,11 @@ class Points:
 
     def believed_resistance(self, own: Floats) -> Floats:
         """Running resistance and gradient at the present speed and place [N/kg], shape (n,)."""
-        return point.resistance(own[:, SPEED], self.constants.davis) + self._climbing(own)
+        return resistance(own[:, SPEED], self.constants.davis) + self._climbing(own)
 
     def _climbing(self, own: Floats) -> Floats:
-        return point.climbing(own[:, POSITION], self.constants.gradient) + GRAVITY * self.constants.slope
+        force: Floats = point.climbing(own[:, POSITION], self.constants.gradient) + GRAVITY * self.constants.slope
+        return force
 
     def step(
         self, k: int, t: float, own: Floats, demand: Demand, ordered: Floats, formed: Formed, messages: Messages, state: State,
@@ -91,7 +95,7 @@ class Points:
         constants = self.constants._replace(resistance_factor=disturbed.resistance)
         kick = point.Kick(disturbed.position, disturbed.speed, disturbed.input)
         asked = np.where(np.isnan(ordered), demand.acceleration, ordered)
-        moved = point.advance(constants, own, asked, self.step_s, kick)
+        moved = self.plant.advance(constants, own, asked, self.step_s, kick)
         mean = (moved.own[:, SPEED] - own[:, SPEED]) / self.step_s
         motion = Motion(moved.displacement, moved.input, mean, mean, moved.limited, moved.clipped, None, {})
         return Moved(moved.own, motion, messages, state)
@@ -129,16 +133,12 @@ class Units:
         self.period = top.communication_period_s
         self.radio = p.radio
         self.gradient = _slopes(p)
-        self.plant: Any
-        if p.scenario.plant.kind == "coupled_units":
-            self.plant = coupled_units.constants(p.plant_params, p.consists, self.gradient)
-        else:
-            self.plant = actuated_units.constants(
-                p.plant_params, p.consists, self.gradient, faults=p.scenario.fault, trains=p.scenario.ids
-            )
-        noisy = p.scenario.plant.kind == "actuated_units" and p.plant_params.noise_variance_m2_per_s6 > 0.0
-        self.noise_hold = p.plant_params.noise_hold_s if noisy else None
-        self.noisy = noisy
+        self.moving = cast(UnitPlant, p.plant)
+        self.plant = self.moving.constants(
+            p.plant_params, p.consists, self.gradient, faults=p.scenario.fault, trains=p.scenario.ids
+        )
+        self.noise_hold = p.plant.noise_hold(p.plant_params)
+        self.noisy = self.noise_hold is not None
         self.breaks = np.unique(
             np.concatenate([p.reference.breaks[np.isfinite(p.reference.breaks)], faults.breaks(p.scenario.fault)])
         )
@@ -167,7 +167,7 @@ class Units:
     def believed_resistance(self, own: Floats) -> Floats:
         """Running resistance and gradient of whole trains per mass [N/kg], shape (n,)."""
         c, v = self.p.consists, own[:, SPEED]
-        per_unit = c.davis[:, 0] + c.davis[:, 1] * v + c.davis[:, 2] * v**2 + self._climbing(own)
+        per_unit = resistance(v, c.davis) + self._climbing(own)
         total: Floats = np.add.reduceat(c.mass * per_unit, c.first[:-1]) / self.masses
         return total
 
@@ -301,19 +301,10 @@ class Units:
 
     def _extras(self, t: float, own: Floats, estimate: Floats, demanded: Floats, loop: integrate.Loop) -> dict[str, Floats]:
         """What actuators, faults and observers do at ``t``, for the log."""
-        if self.p.plant.STATES <= FORCE:
+        if not self.p.plant.COLUMNS:
             return {}
-        rate, power = np.empty_like(own), np.empty(len(POWERS))
-        for i in range(len(self.masses)):
-            rows = slice(self.p.consists.first[i], self.p.consists.first[i + 1])
-            self.p.plant.rate(i, self.plant, t, t, own[rows], demanded[rows], rate[rows], power)
-        return {
-            "law_input": demanded,
-            "fault_mps3": actuated_units.fault(self.plant, t, demanded),
-            "fault_estimate_mps3": self.p.observer.fault_estimate(loop.observer, estimate),
-            "acceleration_mps2": rate[:, SPEED],
-            "acceleration_estimate_mps2": estimate[:, self.p.law.W],
-        }
+        estimated = (f(loop.observer, estimate) for f in (self.p.observer.fault_estimate, self.p.observer.acceleration_estimate))
+        return dict(zip(self.p.plant.COLUMNS, self.moving.columns(self.plant, t, own, demanded, *estimated), strict=True))
 
     def _pieces(self, t: float) -> list[tuple[float, int]]:
         """(start, sub-steps) of the stretches of one simulator step within which messages and noise are held."""
@@ -344,12 +335,8 @@ class Units:
         """Overwrite the plant's noise with the sample at ``t``, or with none."""
         if self.noise_hold is None:
             return
-        if calm:
-            self.plant.units[:, actuated_units.NOISE] = 0.0
-            return
-        sample = math.floor(t / self.noise_hold + 1e-6)
-        noise = actuated_units.noise(self.p.plant_params, self.p.scenario.run.seed or 0, sample, len(self.plant.units))
-        self.plant.units[:, actuated_units.NOISE] = noise
+        sample = None if calm else math.floor(t / self.noise_hold + 1e-6)
+        self.moving.make_noise(self.p.plant_params, self.plant, self.p.scenario.run.seed or 0, sample)
 
     def _disturb(self, disturbed: Disturbed) -> None:
         """Hand this step's disturbing forces and resistance errors to the plant."""

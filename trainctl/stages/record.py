@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from trainctl.monitors import bounds as monitor
-from trainctl.record.recorder import ENERGIES, UNIT_EXTRAS, Recorder, standard_tables
-from trainctl.signals import POSITION, SPEED, Bools, Demand, Disturbed, Extremes, Floats, Formed, Motion, Row, Scene, Seen
+from trainctl.record import columns
+from trainctl.record.recorder import ENERGIES, Recorder, standard_tables
+from trainctl.signals import SPEED, Bools, Demand, Disturbed, Extremes, Floats, Formed, Motion, Row, Scene, Seen
 from trainctl.topology import graph
 
 if TYPE_CHECKING:
@@ -36,10 +37,10 @@ class Journal:
     def __init__(self, folder: Path, p: Prepared, resume: Mapping[str, Any] | None = None) -> None:
         self.p = p
         self.silent = False  # while a run that is resumed begins again
-        self.has_units = p.scenario.plant.kind != "point"
+        self.has_units = p.plant.UNITS
         watched = tuple(getattr(p.law, "WATCHED", ())) if self.has_units and not p.sampled else ()
         self.watched = watched
-        self.extras = UNIT_EXTRAS if p.scenario.plant.kind == "actuated_units" else ()
+        self.extras = p.plant.COLUMNS
         self.disturbances = DISTURBANCES if p.scenario.disturbance else ()
         tables = standard_tables(
             p.scenario.ids, p.line.track_ids, p.line.edges, units=self.has_units, watched=watched,
@@ -52,7 +53,6 @@ class Journal:
         self.saved = time.monotonic()
         self.train_of_unit = np.repeat(np.arange(len(p.scenario.train)), np.diff(p.consists.first))
         self.unit = np.arange(len(self.train_of_unit)) - p.consists.first[:-1][self.train_of_unit] + 1
-        self.last = np.append(self.train_of_unit[1:] != self.train_of_unit[:-1], True)
         self.train_length = p.consists.train_length()
 
     def event(self, time: float, kind: str, **fields: Any) -> None:
@@ -67,56 +67,40 @@ class Journal:
             self.recorder.cut()
             self.saved = time.monotonic()
         n, here = len(row.ahead), slice(None) if row.seen.present.all() else np.flatnonzero(row.seen.present)
-        spacing = np.where(row.ahead >= 0, row.seen.position[row.ahead] - row.seen.position, np.nan)
-        motion = row.motion
-        extra: dict[str, Any] = {}
+        now = columns.trains(row, self.train_length)
+        numbers: dict[str, Any] = {name: value(now) for name, value in columns.TRAINS.items()}
         if self.has_units:
-            extra = self._units(row, here)
+            numbers |= self._units(row, here)
         if self.disturbances:
             acting = [np.full(n, np.nan)] * len(self.disturbances) if row.disturbed is None else row.disturbed
-            extra |= dict(zip(self.disturbances, acting, strict=True))
+            numbers |= dict(zip(self.disturbances, acting, strict=True))
         if not self.p.placed:
-            extra["in_formation"] = row.led.astype(float)
-        columns = dict(
-            train=np.arange(n), track=row.track, edge=row.seen.edge, position_m=row.seen.position,
-            speed_mps=row.speed, input_mps2=np.full(n, np.nan) if motion is None else motion.input, spacing_m=spacing,
-            gap_m=spacing - self.train_length[row.ahead], saturated=row.saturated, **extra,
-        )  # fmt: skip
+            numbers["in_formation"] = row.led.astype(float)
+        numbers |= {"train": np.arange(n), "track": row.track, "edge": row.seen.edge, "saturated": row.saturated}
         if row.seen.present.any():
-            self.recorder.write("trains", time_s=row.time, **{name: column[here] for name, column in columns.items()})
+            self.recorder.write("trains", time_s=row.time, **{name: column[here] for name, column in numbers.items()})
         links = row.links
         if len(links.sender):
             self.recorder.write(
-                "links", time_s=row.time, sender=links.sender, receiver=links.receiver,
-                spacing_m=row.seen.position[links.sender] - row.seen.position[links.receiver],
-                desired_m=links.desired, lower_m=links.lower, upper_m=links.upper, heard=links.heard,
+                "links", time_s=row.time, sender=links.sender, receiver=links.receiver, heard=links.heard,
+                **{name: value(row) for name, value in columns.LINKS.items()},
             )  # fmt: skip
 
     def _units(self, row: Row, here: Any) -> dict[str, Any]:
         """Write the units; returns the further columns of the trains."""
-        p, own = self.p, row.own
-        missing = np.full(len(own), np.nan)
-        stretch, rate = missing.copy(), missing.copy()
-        joined = ~self.last
-        stretch[joined] = own[:-1, POSITION][joined[:-1]] - own[1:, POSITION][joined[:-1]] - p.consists.length[joined]
-        rate[joined] = own[:-1, SPEED][joined[:-1]] - own[1:, SPEED][joined[:-1]]
-        force: Floats = missing if row.motion is None or row.motion.force is None else row.motion.force
-        x = row.extremes
-        assert x is not None
+        now = columns.units(row, self.p.consists)
         units = here if isinstance(here, slice) else np.flatnonzero(row.seen.present[self.train_of_unit])
-        values = dict(
-            train=self.train_of_unit, unit=self.unit,
-            position_m=own[:, POSITION], speed_mps=own[:, SPEED], force_n=force,
-            coupler_m=stretch, coupler_force_n=p.consists.stiffness * stretch + p.consists.damping * rate,
-            coupler_min_m=_widened(np.fmin, x.coupler_min, stretch), coupler_max_m=_widened(np.fmax, x.coupler_max, stretch),
-            force_min_n=_widened(np.fmin, x.force_min, force), force_max_n=_widened(np.fmax, x.force_max, force),
+        missing = np.full(len(self.unit), np.nan)
+        values: dict[str, Any] = {
+            "train": self.train_of_unit, "unit": self.unit, **{name: value(now) for name, value in columns.UNITS.items()},
             **(row.motion.extras if row.motion is not None else dict.fromkeys(self.extras, missing)),
-        )  # fmt: skip
+        }  # fmt: skip
         if row.seen.present.any():
             self.recorder.write("units", time_s=row.time, **{name: column[units] for name, column in values.items()})
-        columns = {f"{name}_min": _finite(x.watched_min[:, q]) for q, name in enumerate(self.watched)}
-        columns |= {f"{name}_max": _finite(x.watched_max[:, q]) for q, name in enumerate(self.watched)}
-        return columns | {name: x.energy[:, q] for q, name in enumerate(ENERGIES)}
+        x, finite = now.extremes, columns.finite
+        further = {f"{name}_min": finite(x.watched_min[:, q]) for q, name in enumerate(self.watched)}
+        further |= {f"{name}_max": finite(x.watched_max[:, q]) for q, name in enumerate(self.watched)}
+        return further | {name: x.energy[:, q] for q, name in enumerate(ENERGIES)}
 
     def close(self) -> None:
         """Complete the files."""
@@ -125,16 +109,6 @@ class Journal:
     def leave(self) -> None:
         """End, with what was written in closed segments, from which the run can be resumed."""
         self.recorder.leave()
-
-
-def _finite(values: Floats) -> Floats:
-    return np.where(np.isfinite(values), values, np.nan)
-
-
-def _widened(pick: Any, extreme: Floats, now: Floats) -> Floats:
-    """Extreme of the sub-steps since the last row, this instant included."""
-    widened: Floats = pick(_finite(extreme), now)
-    return widened
 
 
 class State(NamedTuple):

@@ -35,6 +35,7 @@ import sumo_net
 from sumo_net import LineError
 from trainctl.controllers.sumo import LONGEST_BLOCK_M
 from trainctl.errors import InputError, TrainctlError
+from trainctl.laws import compared
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,7 +58,7 @@ DAVIS = ("c0_n_per_kg", "c1_ns_per_m_kg", "c2_ns2_per_m2_kg")
 
 #: Rows of the table.
 SUMO_ROWS = ("fixed_block", "moving_block", "fixed_block_at_speed", "moving_block_at_speed")
-LAW_ROWS = ("fully_distributed", "robust_constrained", "emu_finite_time", "ordinary_consensus", "fault_tolerant")
+LAW_ROWS = {row: law for row, law in compared().items() if hasattr(law, "on_a_line")}
 ROWS = (*SUMO_ROWS, *LAW_ROWS)
 
 #: What is measured of a row, see ``measure``.
@@ -142,17 +143,20 @@ def scenario(plan: Plan, row: str) -> dict[str, Any]:
         "train_type": {"ice3": ICE3},
         "train": trains,
     }
-    return {**tables, **CHANGES[row](plan, tables)}
+    if row in SUMO_ROWS:
+        return {**tables, **_sumo(plan, row, tables)}
+    law = LAW_ROWS[row]
+    tables["controller"] = {"law": law.__name__.rpartition(".")[2], **law.COMPARED[row]}
+    return {**tables, **law.on_a_line(tables, _band(plan))}
 
 
-def _sumo(block: str, at_speed: bool) -> Callable[[Plan, dict[str, Any]], dict[str, Any]]:
-    def change(plan: Plan, tables: dict[str, Any]) -> dict[str, Any]:
-        controller = {"law": "sumo", "block": block, "entry_m": plan.begin_m, "top_speed_mps": plan.speed_mps}
-        if at_speed:
-            controller |= {"entry_speed_mps": plan.speed_mps, "entry_every_s": math.ceil(headway_bound(plan, block))}
-        return {"controller": controller, "run": {**tables["run"], "duration_s": math.ceil(sumo_duration(plan))}}
-
-    return change
+def _sumo(plan: Plan, row: str, tables: dict[str, Any]) -> dict[str, Any]:
+    """Tables of one of SUMO's rows."""
+    block = row.partition("_")[0]
+    controller = {"law": "sumo", "block": block, "entry_m": plan.begin_m, "top_speed_mps": plan.speed_mps}
+    if row.endswith("at_speed"):
+        controller |= {"entry_speed_mps": plan.speed_mps, "entry_every_s": math.ceil(headway_bound(plan, block))}
+    return {"controller": controller, "run": {**tables["run"], "duration_s": math.ceil(sumo_duration(plan))}}
 
 
 def headway_bound(plan: Plan, block: str) -> float:
@@ -172,63 +176,9 @@ def sumo_duration(plan: Plan) -> float:
     return 2.0 * (plan.trains * (braking + 2.0 * plan.signals_m) + plan.length_m) / plan.speed_mps + 1000.0
 
 
-def _fully_distributed(plan: Plan, tables: dict[str, Any]) -> dict[str, Any]:
-    period = 10.0  # what is left of 8 MW at this speed must do for a move within the band: Assumption 2.4
-    return {
-        "controller": {"law": "fully_distributed", "eta": "own_speed"}, "bounds": _band(plan),
-        "run": {**tables["run"], "control_period_s": period, "duration_s": _multiple(tables["run"]["duration_s"], period)},
-    }  # fmt: skip
-
-
-def _robust_constrained(plan: Plan, tables: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "controller": {"law": "robust_constrained", "h_per_s": 0.3},
-        "bounds": _band(plan),
-        "run": {**tables["run"], "control_period_s": 1.0},
-        "topology": {**tables["topology"], "weight": 0.01},
-    }
-
-
-def _emu(alpha: float) -> Callable[[Plan, dict[str, Any]], dict[str, Any]]:
-    def change(plan: Plan, tables: dict[str, Any]) -> dict[str, Any]:
-        clear = plan.spacing_m - float(ICE3["unit_length_m"])
-        least = tables["topology"]["lower_m"] - float(ICE3["unit_length_m"])
-        return {
-            "controller": {
-                "law": "emu_finite_time", "alpha_1": alpha, "emergency_distance_m": least,
-                "emergency_zone_m": 0.4 * (clear - least), "range_m": max(10_000.0, 2.0 * plan.spacing_m),
-            },
-            "run": {**tables["run"], "sub_step_s": 0.02},
-        }  # fmt: skip
-
-    return change
-
-
-def _fault_tolerant(plan: Plan, tables: dict[str, Any]) -> dict[str, Any]:
-    half = 0.5 * plan.spacing_m
-    bounds = {"leader_error_lower_m": -half, "leader_error_upper_m": half, "head_l1_per_s": min(0.01, 0.5 * 50.0 / half)}
-    return {
-        "controller": {"law": "fault_tolerant", **bounds},
-        "plant": {"kind": "actuated_units"}, "observer": {"kind": "asymptotic"},
-        "run": {**tables["run"], "sub_step_s": 0.01},
-    }  # fmt: skip
-
-
 def _band(plan: Plan) -> dict[str, float]:
     """Speed bounds for the laws that have both."""
     return {"speed_lower_mps": plan.cruise_mps - BAND_MPS, "speed_upper_mps": plan.speed_mps}
-
-
-def _multiple(value: float, of: float) -> float:
-    return math.ceil(value / of) * of
-
-
-CHANGES: dict[str, Callable[[Plan, dict[str, Any]], dict[str, Any]]] = {
-    "fixed_block": _sumo("fixed", False), "moving_block": _sumo("moving", False),
-    "fixed_block_at_speed": _sumo("fixed", True), "moving_block_at_speed": _sumo("moving", True),
-    "fully_distributed": _fully_distributed, "robust_constrained": _robust_constrained,
-    "emu_finite_time": _emu(0.9), "ordinary_consensus": _emu(1.0), "fault_tolerant": _fault_tolerant,
-}  # fmt: skip
 
 
 # What is measured

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from trainctl.errors import InputError
 from trainctl.figures import style
 from trainctl.figures.trains import Drawn, draw_inputs, draw_speeds, prepare
+from trainctl.laws import compared, find_plant, plants_of
 from trainctl.metrics.run import DEFINITIONS, metrics
 from trainctl.metrics.values import Values
 from trainctl.runs.known import leader
@@ -127,15 +128,6 @@ PANELS: dict[str, Callable[[Axes, Drawn], None]] = {
 
 # --- the other laws on the same traffic -------------------------------------------------------------------------------------------
 
-#: Bounds that the point plant can clamp at.
-CLAMPS = ("speed_lower_mps", "speed_upper_mps", "input_lower_mps2", "input_upper_mps2")
-#: Rows of a comparison, in order -> their law: ordinary consensus and SUMO's two kinds of block are keys of one.
-LAWS = {
-    "fully_distributed": "fully_distributed", "robust_constrained": "robust_constrained", "emu_finite_time": "emu_finite_time",
-    "ordinary_consensus": "emu_finite_time", "fault_tolerant": "fault_tolerant", "sumo_fixed_block": "sumo",
-    "sumo_moving_block": "sumo",
-}  # fmt: skip
-
 
 def alternatives(data: Mapping[str, Any], known: Sequence[str]) -> dict[str, dict[str, Any]]:
     """The scenario under every law that there is.
@@ -153,81 +145,38 @@ def alternatives(data: Mapping[str, Any], known: Sequence[str]) -> dict[str, dic
         Name of the row -> tables of its scenario. Keys of the laws' own that have a counterpart in the scenario's bounds are
         derived from it; all others are the law's defaults (the paper's).
     """
-    found: dict[str, dict[str, Any]] = {}
-    for name, law in LAWS.items():
-        if law in known:
-            found[name] = dict(data) if name == _row(data["controller"]) else _under(name, law, data)
-    return found
-
-
-def _row(controller: Mapping[str, Any]) -> str:
-    """The row a scenario is as it stands."""
-    law = str(controller["law"])
-    if law == "emu_finite_time" and float(controller.get("alpha_1", 0.9)) == 1.0:
-        return "ordinary_consensus"
-    return f"sumo_{controller.get('block', 'fixed')}_block" if law == "sumo" else law
-
-
-def _under(name: str, law: str, data: Mapping[str, Any]) -> dict[str, Any]:
-    changed: dict[str, Any] = {key: value for key, value in data.items() if key not in ("controller", "observer")}
-    changed["title"] = f"{name.replace('_', ' ')} on the traffic of: {data.get('title', '')}"
-    run = {"step_s": 1.0, **{key: value for key, value in data["run"].items() if key != "control_period_s"}}
-    topology = dict(data.get("topology", {}))
-    plant = data.get("plant", {"kind": "point"})
-    point = plant.get("kind", "point") == "point"
-    controller: dict[str, Any] = {"law": law}
-    if law == "fully_distributed":
-        controller["eta"] = "own_speed"
-        run["control_period_s"] = run["step_s"] * max(1.0, round(8.0 / run["step_s"]))
-    elif law == "robust_constrained":
-        controller["h_per_s"] = 0.3
-        topology["weight"] = 0.01
-        run["control_period_s"] = run["step_s"] * max(1.0, round(1.0 / run["step_s"]))
-        if point:  # its model clamps speed and input
-            changed["plant"] = {**plant, **{key: value for key, value in data.get("bounds", {}).items() if key in CLAMPS}}
-    elif law == "emu_finite_time":
-        controller |= _clear_distances(data) | {"alpha_1": 1.0 if name == "ordinary_consensus" else 0.9}
-        run["sub_step_s"] = 0.0025 if name == "ordinary_consensus" else 0.01
-    elif law == "sumo":
-        controller["block"] = "fixed" if name == "sumo_fixed_block" else "moving"
-    elif law == "fault_tolerant":
-        error = max((abs(value) for value in _errors_allowed(data)), default=2351.0)
-        far = 2.0 * error  # of a train that follows the reference from another train's slot
-        controller |= {"leader_error_lower_m": -far, "leader_error_upper_m": far, "head_l1_per_s": min(0.01, 0.5 * 50.0 / far)}
-        changed["plant"] = {"kind": "actuated_units"}
-        changed["observer"] = {"kind": "asymptotic"}
-        changed["train_type"] = {key: {"actuator_rate_per_s": 50.0, **kind} for key, kind in data.get("train_type", {}).items()}
-        run["sub_step_s"] = 0.01
-    if not point and law != "fault_tolerant":
-        changed["plant"] = plant if plant["kind"] == "coupled_units" else {"kind": "coupled_units"}
-    return {**changed, "run": run, "topology": topology, "controller": controller}
-
-
-def _clear_distances(data: Mapping[str, Any]) -> dict[str, float]:
-    """Emergency distance and range of the finite-time law from the bounds of the links, less the longest train."""
-    lengths = [_length(kind) for kind in data.get("train_type", {}).values()]
-    longest = max(lengths, default=0.0)
-    places = [data.get("topology", {}), *data.get("link", ())]
-    lower = [float(place["lower_m"]) for place in places if np.isfinite(place.get("lower_m", np.inf))]
-    upper = [float(place["upper_m"]) for place in places if np.isfinite(place.get("upper_m", np.inf))]
-    least = max(1.0, min(lower, default=1500.0 + longest) - longest)
-    desired = float(data.get("topology", {}).get("spacing_m", 3000.0 + longest)) - longest
+    name = str(data["controller"]["law"])
     return {
-        "emergency_distance_m": least, "emergency_zone_m": min(600.0, 0.4 * max(desired - least, 1.0)),
-        "range_m": max([10000.0, *upper]),
+        row: dict(data) if name == _name(law) and row == _row(law, data["controller"]) else _under(row, law, data)
+        for row, law in compared().items() if _name(law) in known
     }  # fmt: skip
 
 
-def _length(kind: Mapping[str, Any]) -> float:
-    units, length = int(kind.get("units", 1)), kind.get("unit_length_m", 0.0)
-    return float(sum(length)) if isinstance(length, list) else units * float(length)
+def _name(law: Any) -> str:
+    """How a scenario names a law of ours."""
+    return str(law.__name__).rpartition(".")[2]
 
 
-def _errors_allowed(data: Mapping[str, Any]) -> list[float]:
-    topology = data.get("topology", {})
-    found = []
-    for place in (topology, *data.get("link", ())):
-        desired = place.get("desired_m", topology.get("spacing_m"))
-        if desired is not None:
-            found += [float(place[key]) - float(desired) for key in ("lower_m", "upper_m") if np.isfinite(place.get(key, np.inf))]
-    return found
+def _row(law: Any, controller: Mapping[str, Any]) -> str:
+    """The row of its law a scenario is as it stands: the last whose keys it has, else the first."""
+    rows: dict[str, dict[str, Any]] = law.COMPARED
+    fitting = [row for row, keys in rows.items() if all(controller.get(key) == value for key, value in keys.items())]
+    return (fitting or list(rows))[-1 if fitting else 0]
+
+
+def _under(row: str, law: Any, data: Mapping[str, Any]) -> dict[str, Any]:
+    """The scenario under another law, on a plant the law runs on where there is one of the same sort."""
+    changed: dict[str, Any] = {key: value for key, value in data.items() if key not in ("controller", "observer")}
+    changed["title"] = f"{row.replace('_', ' ')} on the traffic of: {data.get('title', '')}"
+    changed["run"] = {"step_s": 1.0, **{key: value for key, value in data["run"].items() if key != "control_period_s"}}
+    changed["topology"] = dict(data.get("topology", {}))
+    changed["controller"] = {"law": _name(law), **law.COMPARED[row]}
+    plant = {"kind": "point", **data.get("plant", {})}
+    module, usual = find_plant(str(plant["kind"])), plants_of(law)
+    if plant["kind"] not in usual:
+        plant = next(({"kind": kind} for kind in usual if find_plant(kind).UNITS == module.UNITS), plant)
+    if getattr(law, "CLAMPED", False):  # its model clamps, where the plant can do so by itself it does
+        clamps = find_plant(str(plant["kind"])).CLAMPS
+        plant |= {key: value for key, value in data.get("bounds", {}).items() if key in clamps}
+    changed["plant"] = plant
+    return {**changed, **(law.alternative(changed) if hasattr(law, "alternative") else {})}
