@@ -36,15 +36,16 @@ class Journal:
     def __init__(self, folder: Path, p: Prepared, resume: Mapping[str, Any] | None = None) -> None:
         self.p = p
         self.silent = False  # while a run that is resumed begins again
-        self.has_units = p.scenario.plant.kind != "point"
+        self.has_units, self.has_energies = p.has_units, p.has_units or p.self_driven
         watched = tuple(getattr(p.law, "WATCHED", ())) if self.has_units and not p.sampled else ()
         self.watched = watched
         self.extras = UNIT_EXTRAS if p.scenario.plant.kind == "actuated_units" else ()
         self.disturbances = DISTURBANCES if p.scenario.disturbance else ()
+        self.formed = not (p.placed or p.self_driven)
         tables = standard_tables(
             p.scenario.ids, p.line.track_ids, p.line.edges, units=self.has_units, watched=watched,
             train_extras=(
-                *(ENERGIES if self.has_units else ()), *self.disturbances, *(() if p.placed else ("in_formation",)),
+                *(ENERGIES if self.has_energies else ()), *self.disturbances, *(("in_formation",) if self.formed else ()),
             ),
             unit_extras=self.extras,
         )  # fmt: skip
@@ -67,15 +68,20 @@ class Journal:
             self.recorder.cut()
             self.saved = time.monotonic()
         n, here = len(row.ahead), slice(None) if row.seen.present.all() else np.flatnonzero(row.seen.present)
-        spacing = np.where(row.ahead >= 0, row.seen.position[row.ahead] - row.seen.position, np.nan)
+        spacing = row.spacing
+        if spacing is None:
+            spacing = np.where(row.ahead >= 0, row.seen.position[row.ahead] - row.seen.position, np.nan)
         motion = row.motion
         extra: dict[str, Any] = {}
         if self.has_units:
             extra = self._units(row, here)
+        if self.has_energies:
+            assert row.extremes is not None
+            extra |= {name: row.extremes.energy[:, q] for q, name in enumerate(ENERGIES)}
         if self.disturbances:
             acting = [np.full(n, np.nan)] * len(self.disturbances) if row.disturbed is None else row.disturbed
             extra |= dict(zip(self.disturbances, acting, strict=True))
-        if not self.p.placed:
+        if self.formed:
             extra["in_formation"] = row.led.astype(float)
         columns = dict(
             train=np.arange(n), track=row.track, edge=row.seen.edge, position_m=row.seen.position,
@@ -115,8 +121,7 @@ class Journal:
         if row.seen.present.any():
             self.recorder.write("units", time_s=row.time, **{name: column[units] for name, column in values.items()})
         columns = {f"{name}_min": _finite(x.watched_min[:, q]) for q, name in enumerate(self.watched)}
-        columns |= {f"{name}_max": _finite(x.watched_max[:, q]) for q, name in enumerate(self.watched)}
-        return columns | {name: x.energy[:, q] for q, name in enumerate(ENERGIES)}
+        return columns | {f"{name}_max": _finite(x.watched_max[:, q]) for q, name in enumerate(self.watched)}
 
     def close(self) -> None:
         """Complete the files."""
@@ -195,9 +200,13 @@ class Record:
             links=formed.links, motion=motion, saturated=demand.saturated if motion is None else demand.saturated | motion.limited,
             extremes=past, disturbed=disturbed, led=formed.led,
         )  # fmt: skip
+        self.tell(row, ways, here, self.due(k), s)
+
+    def tell(self, row: Row, ways: Ways, here: Seen, due: bool, s: State) -> None:
+        """The alarms of one instant, then its row, if one is ``due``."""
         for alarm in self.alarms.new(row, ways, here, s.alarms):
-            self.journal.event(t, "violation", **alarm)
-        if self.due(k):
+            self.journal.event(row.time, "violation", **alarm)
+        if due:
             self.journal.write(row)
 
     def waits(self, t: float, here: Seen, speed: Floats, traffic: Traffic, around: Around, due: Sequence[int], s: State) -> None:
