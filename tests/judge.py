@@ -55,7 +55,7 @@ class Recording:
     def look(self, sim: Any) -> None:
         """Write down where the fronts are, as the world measures it."""
         seen, ways = sim.world.measure(), sim.world.ways
-        own, heads = sim.own, self.p.heads
+        own, heads = sim.state.own, self.p.heads
         along = seen.position - ways.begin[ways.first[:-1]]
         least = np.minimum.reduceat(own[:, 1], heads)
         self.rows.append((sim.time, along, own[heads, 1].copy(), least, seen.present.copy()))
@@ -75,7 +75,7 @@ def behind(p: Prepared, edge: int) -> int:
     """The edge before another one, if that is certain; -1: there is none, or several."""
     rails = p.rails
     found = [e for e in rails.before[edge] if (e, edge) not in rails.reversal]
-    if p.roster is None:  # tracks of a line go straight on, crossovers come in from the side
+    if p.placed:  # tracks of a line go straight on, crossovers come in from the side
         over = {rails.index[c.edge] for c in p.line.crossovers}
         found = [e for e in found if e not in over and p.line.tracks[e] == p.line.tracks[edge]]
     return found[0] if len(found) == 1 else -1
