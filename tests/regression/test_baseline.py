@@ -239,6 +239,17 @@ def test_mistakes_are_one_line(tmp_path: Path, keys: dict[str, Any], line: str) 
     assert not (tmp_path / "run").exists() and not (tmp_path / "run.partial").exists()
 
 
+def test_signals_that_cannot_stand_are_found_before_the_run(tmp_path: Path) -> None:
+    over = {"id": "over", "from": "1", "to": "2", "position_m": 14000.004, "length_m": 100.0, "speed_mps": 60.0}
+    path = scenario(tmp_path, line={"tracks": ["1", "2"], "crossover": [over]})
+    with pytest.raises(
+        InputError, match=r"short_scenario.toml: network: short: tracks = 1: the signal at 14000 m and the switch of over"
+    ):
+        open_scenario(str(path))  # 2 km apart by default
+    line = open_scenario(str(path), {"controller.signals_m": 3000.0}).line
+    assert {x for x in line.start_m.tolist() if x < 7000.0} == {0.0, 3000.0, 6000.0}
+
+
 def test_what_sumo_would_not_feel_is_refused() -> None:
     from trainctl.scenario.build import prepare
     from trainctl.scenario.reading import read
