@@ -1,4 +1,4 @@
-"""The closed loop of trains on a railway. ``Loop.step`` is the whole data flow, in the order of the README's list.
+"""The closed loop of trains on a railway. ``Loop.after`` is the whole data flow, in the order of the README's list.
 
 Every stage is made once from the scenario; what changes lies in ``State``, which each takes and gives. Arrays in it may be reused
 in place by the stage that owns them.
@@ -6,7 +6,6 @@ in place by the stage that owns them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -20,6 +19,7 @@ from trainctl.scenario.build import Prepared
 from trainctl.scenario.tables import Event
 from trainctl.signals import POSITION, SPEED, Bools, Demand, Disturbed, Floats, Formed, Messages, Motion, Seen, Start
 from trainctl.stages import control, driver, orders, plant, protect, record, topology, traffic
+from trainctl.steps import Steps
 from trainctl.topology import exchange
 from trainctl.world import World
 
@@ -44,7 +44,7 @@ class State(NamedTuple):
     watch: record.State
 
 
-class Loop:
+class Loop(Steps):
     """The stages of one run, made once from its scenario; ``state`` is where it stands.
 
     Parameters
@@ -57,17 +57,17 @@ class Loop:
         Where rows and events go.
     """
 
+    state: State
+
     def __init__(self, prepared: Prepared, world: World, journal: record.Journal) -> None:
-        self.p, self.world, self.journal = prepared, world, journal
+        super().__init__(prepared, journal)
+        self.world = world
         p, run = prepared, prepared.scenario.run
         self.disturbances = disturbance.prepare(p.scenario.disturbance, p.scenario.ids, run.step_s, run.seed, p.worst)
         self.orders, self.traffic = orders.Orders(p, journal), traffic.Traffic(p, journal)
         self.topology = topology.Topology(p, journal)
         self.control, self.driver, self.plant = control.Control(p), driver.Driver(p), plant.of(p)
         self.protect = protect.Protect(p, journal, bool(len(self.disturbances.whole)) or self.plant.noisy)
-        self.record = record.Record(p, journal)
-        self.not_entered = 0
-        self.between: Callable[[], Any] | None = None  # called after every step
         rule, formed = self.topology.rule.initial()
         self.state = State(
             k=0, own=p.own.copy(), pending=self.orders.initial(), traffic=self.traffic.initial(), rule=rule, formed=formed,
@@ -75,22 +75,6 @@ class Loop:
             commanded=np.full(len(p.scenario.ids), np.nan), plant=self.plant.initial(), watch=self.record.initial(),
         )  # fmt: skip
         self._start()
-
-    @property
-    def k(self) -> int:
-        """Steps done."""
-        return self.state.k
-
-    @property
-    def time(self) -> float:
-        """Scenario time of the present state [s]."""
-        return self.state.k * self.p.scenario.run.step_s
-
-    def step(self) -> None:
-        """One simulator step of the closed loop."""
-        self.state = self.after(self.state)
-        if self.between is not None:
-            self.between()
 
     def after(self, s: State) -> State:
         """The state a step later."""
@@ -153,16 +137,6 @@ class Loop:
             s.k + 1, moved.own, pending, going, rule, formed, moved.messages, demand, memory, s.commanded, moved.state, watch
         )  # fmt: skip
 
-    def run(self, progress: Callable[[int, int], Any] | None = None) -> None:
-        """All steps; ``progress(done, steps)`` is called about a hundred times."""
-        steps = self.p.scenario.run.steps
-        every = max(1, steps // 100)
-        while self.k < steps:
-            self.step()
-            if progress is not None and self.k % every == 0:
-                progress(self.k, steps)
-        self.end()
-
     def end(self) -> None:
         """The last instant, which nothing acts on: arrivals, but no entries or orders; watched and recorded as any other."""
         s, world, t = self.state, self.world, self.time
@@ -189,10 +163,6 @@ class Loop:
         commanded = self.state.commanded.copy()
         commanded[trains] = acceleration
         self.state = self.state._replace(commanded=commanded)
-
-    def counted(self, collisions: Sequence[Mapping[str, Any]]) -> Iterator[tuple[float, dict[str, Any]]]:
-        """Time [s] and fields of events for collisions of the simulator's that were not told before."""
-        return self.record.alarms.counted(self.time, collisions, self.state.watch.alarms)
 
     def order(self, event: Event) -> None:
         """Give an order from outside."""

@@ -42,7 +42,9 @@ from trainctl.scenario import promise, roster
 from trainctl.scenario.build import Prepared, prepare
 from trainctl.scenario.reading import examine
 from trainctl.stages.record import Journal
-from trainctl.world import World
+from trainctl.steps import Steps
+from trainctl.watched import Watched
+from trainctl.world import SelfDriven, World
 
 Backend = Literal["sumo", "numeric"]
 
@@ -90,14 +92,9 @@ def run(
     TrainctlError
         The run failed; ``out.partial`` keeps what was recorded, and run.json says why and when.
     """
-    if p.law.CLOCK == "none":
-        if backend != "sumo" or gui is not None or checkpoint_every_s is not None:
-            raise InputError("controller.law = sumo: SUMO drives by itself: no --backend numeric, --gui or --checkpoint-every")
-        from trainctl.sumo import baseline
-
-        with _stops():
-            return baseline.run(p, out, force, command_line, progress)
-    with opened(p, out, backend, force, command_line, gui, checkpoint_every_s) as simulation:
+    if p.self_driven and (backend != "sumo" or gui is not None or checkpoint_every_s is not None):
+        raise InputError("controller.law = sumo: SUMO drives by itself: no --backend numeric, --gui or --checkpoint-every")
+    with _opened(p, out, backend, force, command_line, gui, checkpoint_every_s) as simulation:
         simulation.run(progress)
     return Run(out)
 
@@ -116,8 +113,19 @@ def opened(
 
     When the block ends the run is complete; when it raises, the run failed.
     """
-    if p.law.CLOCK == "none":
+    if p.self_driven:
         raise InputError("controller.law = sumo: SUMO drives by itself; `trainctl run` runs it")
+    with _opened(p, out, backend, force, command_line, gui, checkpoint_every_s) as simulation:
+        assert isinstance(simulation, Loop)
+        yield simulation
+
+
+@contextmanager
+def _opened(
+    p: Prepared, out: Path, backend: Backend, force: bool, command_line: Sequence[str], gui: str | None,
+    checkpoint_every_s: float | None,
+) -> Iterator[Steps]:  # fmt: skip
+    """The same for every run, whoever drives its trains."""
     every = checkpoint_every_s
     step = p.scenario.run.step_s
     if every is not None and not (every >= step and abs(every / step - round(every / step)) < 1e-6):
@@ -127,7 +135,7 @@ def opened(
     partial = claim(out, force)
     with held(partial):
         text = p.scenario.toml()
-        protection = {"protection": promise.told(p)} if p.supervision.mode != "off" else {}
+        protection = {"protection": promise.told(p)} if p.supervision.mode != "off" and not p.self_driven else {}
         info = about_run(text, p.scenario.run.seed or 0, command_line or sys.argv, backend=backend, **protection)
         write_info(partial, info)
         (partial / "scenario.toml").write_text(text, encoding="utf-8")
@@ -196,13 +204,16 @@ def resume(folder: Path, progress: Callable[[int, int], Any] | None = None) -> t
 @contextmanager
 def _driven(
     p: Prepared, partial: Path, info: dict[str, Any], gui: str | None, every_s: float | None, saved: checkpoint.Saved | None
-) -> Iterator[Loop]:
+) -> Iterator[Steps]:
     """The loop in its folder, from the beginning or from a checkpoint, and what is left to do when it has ended."""
     place = partial / checkpoint.FOLDER
     # not zeros: some file systems keep no room for those
     (place / checkpoint.RESERVE).write_bytes(os.urandom(checkpoint.RESERVE_BYTES))
     began = time.perf_counter() - (saved.values["wall_time_s"] if saved else 0.0)
-    journal, world, simulation, tape = None, None, None, None
+    journal: Journal | None = None
+    world: World | SelfDriven | None = None
+    simulation: Steps | None = None
+    tape: checkpoint.Tape | None = None
 
     def elapsed() -> float:
         return round(time.perf_counter() - began, 3)
@@ -210,14 +221,18 @@ def _driven(
     try:
         with _stops() as stop:
             journal = Journal(partial, p, saved.values["recorder"] if saved else None)
-            world = open_world(p, partial, info["backend"], gui)
-            if every_s is not None:
-                world = tape = checkpoint.Tape(world, place, saved)
-            journal.silent = saved is not None  # what a run told when it began is written already
-            simulation = Loop(p, world, journal)
-            if saved is not None and tape is not None:
-                checkpoint.restore(simulation, tape, saved)
-            journal.silent = False
+            if p.self_driven:
+                world = open_self_driven(p, partial)
+                simulation = Watched(p, world, journal)
+            else:
+                world = open_world(p, partial, info["backend"], gui)
+                if every_s is not None:
+                    world = tape = checkpoint.Tape(world, place, saved)
+                journal.silent = saved is not None  # what a run told when it began is written already
+                simulation = Loop(p, world, journal)
+                if saved is not None and tape is not None:
+                    checkpoint.restore(simulation, tape, saved)
+                journal.silent = False
             simulation.between = _Between(simulation, journal, tape, place, every_s, stop, elapsed)
             stop.waits = True
             yield simulation
@@ -261,7 +276,7 @@ class _Between:
     """What happens between two steps: a checkpoint if one is due, an end if one was asked for."""
 
     def __init__(
-        self, simulation: Loop, journal: Journal, tape: checkpoint.Tape | None, place: Path, every_s: float | None,
+        self, simulation: Steps, journal: Journal, tape: checkpoint.Tape | None, place: Path, every_s: float | None,
         stop: _Stop, elapsed: Callable[[], float],
     ) -> None:  # fmt: skip
         self.simulation, self.journal, self.tape, self.place, self.stop, self.elapsed = (
@@ -274,6 +289,7 @@ class _Between:
         asked = self.stop.asked
         if self.tape is not None and (asked is not None or self.simulation.k % self.every == 0):
             more = {"recorder": self.journal.recorder.cut(), "tape": self.tape.save(), "wall_time_s": self.elapsed()}
+            assert isinstance(self.simulation, Loop)
             checkpoint.write(self.place, self.simulation, {**self.identity, **more})
         if asked is not None:
             raise KeyboardInterrupt(f"interrupted by {asked}")
@@ -368,17 +384,29 @@ def open_world(p: Prepared, folder: Path, backend: Backend, gui: str | None = No
         return Numeric(p.line)
     from trainctl.sumo.session import Sumo
 
-    run, place = p.scenario.run, folder / "sumo"
-    place.mkdir()
-    try:
-        net = sumo_net.build(p.spec, place) if p.net is None else unpack(p.net, place)
-    except LineError as error:
-        raise SimulatorError("; ".join(error.mistakes)) from None
+    run, (net, place) = p.scenario.run, _net(p, folder)
     if gui is not None:
         from trainctl.sumo.gui import Gui, Map
 
         return (Gui if p.placed else Map)(p.line, net, place, run.step_s, run.steps, run.record_every_s, gui)
     return Sumo(p.line, net, place, run.step_s, run.steps, run.record_every_s)
+
+
+def open_self_driven(p: Prepared, folder: Path) -> SelfDriven:
+    """SUMO with its own drivers; its inputs and logs go to ``folder/sumo``."""
+    from trainctl.sumo.baseline import Baseline
+
+    return Baseline(p, *_net(p, folder))
+
+
+def _net(p: Prepared, folder: Path) -> tuple[Path, Path]:
+    """The net for SUMO, and the folder it lies in."""
+    place = folder / "sumo"
+    place.mkdir()
+    try:
+        return (sumo_net.build(p.spec, place) if p.net is None else unpack(p.net, place)), place
+    except LineError as error:
+        raise SimulatorError("; ".join(error.mistakes)) from None
 
 
 def _quietly(function: Callable[..., None], *arguments: Any, **more: Any) -> None:

@@ -393,6 +393,15 @@ class Seen(NamedTuple):
     present: Bools
 
 
+class Observed(NamedTuple):
+    """What a simulator says of trains that it drives itself, shape (n,)."""
+
+    seen: Seen
+    speed: Floats  # m/s, NaN of trains that are not there
+    ahead: Ints  # train ahead, -1: none
+    spacing: Floats  # m, to its front; NaN: none
+
+
 class Disturbed(NamedTuple):
     """What acts in one step, shape (n,)."""
 
@@ -497,3 +506,4 @@ class Row(NamedTuple):
     extremes: Extremes | None  # over the sub-steps since the last row
     disturbed: Disturbed | None  # what acts from this instant on
     led: Bools  # (n,) trains the law drives
+    spacing: Floats | None = None  # (n,) m, to the train ahead, as the simulator has it; None: difference of the positions

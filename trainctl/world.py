@@ -1,11 +1,14 @@
-"""Where trains are, seen from the loop: SUMO (``trainctl.sumo``) or plain arithmetic on the same line (``--backend numeric``)."""
+"""Where trains are, seen from the loop: SUMO (``trainctl.sumo``) or plain arithmetic on the same line (``--backend numeric``).
+
+``SelfDriven`` is a simulator that decides by itself how its trains move.
+"""
 
 from __future__ import annotations
 
 from typing import Any, Protocol
 
 from trainctl.railway.ways import Ways
-from trainctl.signals import Floats, Ints, Links, Seen, Start
+from trainctl.signals import Floats, Ints, Links, Observed, Seen, Start
 
 
 class World(Protocol):
@@ -41,3 +44,40 @@ class World(Protocol):
 
     def collisions(self) -> list[dict[str, Any]]:
         """Collisions the simulator counted, complete after ``close``: time_s, trains (the one run into first), edge, edge_m."""
+
+
+class SelfDriven(Protocol):
+    """A simulator that drives its trains itself, as ``trainctl.watched`` needs it."""
+
+    @property
+    def ways(self) -> Ways:
+        """The ways of all trains as they are now ordered."""
+
+    @property
+    def planned(self) -> Floats:
+        """When every train is to enter [s], shape (n,)."""
+
+    @property
+    def over(self) -> bool:
+        """Whether every train has left, and nobody is still to come."""
+
+    def start(self) -> None:
+        """Let the first trains in; afterwards ``measure`` gives the state at time 0."""
+
+    def measure(self) -> Observed:
+        """Where every train is now, how fast, and behind whom."""
+
+    def route(self, train: int, edges: tuple[str, ...]) -> None:
+        """Give a train another route; ``edges`` begins with the edge it is on, internal ones included."""
+
+    def step(self) -> None:
+        """Go on by one step."""
+
+    def close(self) -> None:
+        """End the simulation and its logs."""
+
+    def messages(self) -> list[tuple[float | None, str]]:
+        """As of ``World``."""
+
+    def collisions(self) -> list[dict[str, Any]]:
+        """As of ``World``."""

@@ -22,7 +22,7 @@ from trainctl.scenario.build import open_scenario
 from trainctl.scenario.reading import examine
 from trainctl.signals import GRAVITY
 from trainctl.studies import capacity
-from trainctl.sumo.baseline import Session
+from trainctl.sumo.baseline import Baseline
 
 SECTION = 24000.0
 
@@ -239,6 +239,17 @@ def test_mistakes_are_one_line(tmp_path: Path, keys: dict[str, Any], line: str) 
     assert not (tmp_path / "run").exists() and not (tmp_path / "run.partial").exists()
 
 
+def test_signals_that_cannot_stand_are_found_before_the_run(tmp_path: Path) -> None:
+    over = {"id": "over", "from": "1", "to": "2", "position_m": 14000.004, "length_m": 100.0, "speed_mps": 60.0}
+    path = scenario(tmp_path, line={"tracks": ["1", "2"], "crossover": [over]})
+    with pytest.raises(
+        InputError, match=r"short_scenario.toml: network: short: tracks = 1: the signal at 14000 m and the switch of over"
+    ):
+        open_scenario(str(path))  # 2 km apart by default
+    line = open_scenario(str(path), {"controller.signals_m": 3000.0}).line
+    assert {x for x in line.start_m.tolist() if x < 7000.0} == {0.0, 3000.0, 6000.0}
+
+
 def test_what_sumo_would_not_feel_is_refused() -> None:
     from trainctl.scenario.build import prepare
     from trainctl.scenario.reading import read
@@ -264,24 +275,34 @@ def test_fixed_block_needs_signals(tmp_path: Path) -> None:
     assert not (tmp_path / "run.partial").exists()
 
 
-@pytest.mark.parametrize("how", ["failed", "interrupted"])
-def test_what_was_recorded_stays_if_the_run_does_not_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
-    read = Session._read
+@pytest.mark.parametrize(("how", "steps"), [("failed", 30), ("interrupted", 31)])
+def test_what_was_recorded_stays_if_the_run_does_not_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str, steps: int
+) -> None:
+    """Whoever asks a run to stop is given the step that is under way, as in every run; ``resume`` begins again."""
+    step = Baseline.step
 
-    def trouble(self: Session) -> Any:
-        if self.k == 30 and how == "interrupted":
+    def trouble(self: Baseline) -> None:
+        if self._time() == 30.0 and how == "interrupted":
             os.kill(os.getpid(), signal.SIGTERM)
-        elif self.k == 30:
+        elif self._time() == 30.0:
             raise SimulatorError("it broke")
-        return read(self)
+        step(self)
 
-    monkeypatch.setattr(Session, "_read", trouble)
-    with pytest.raises(SimulatorError if how == "failed" else KeyboardInterrupt):
-        run(scenario(tmp_path), tmp_path / "run")
+    path, whole = scenario(tmp_path, trains=2), {"run.duration_s": 60.0}
+    with monkeypatch.context() as patch:
+        patch.setattr(Baseline, "step", trouble)
+        with pytest.raises(SimulatorError if how == "failed" else KeyboardInterrupt):
+            run(path, tmp_path / "run", **whole)
     left = Run(tmp_path / "run.partial")
-    assert (left.info["status"], left.info["steps"], left.info["failure"]["time_s"]) == (how, 30, 30.0)
-    assert left.trains["time_s"].max() == 29.0
-    run(scenario(tmp_path), tmp_path / "again", **{"run.duration_s": 20.0})  # SUMO was ended: it starts again
+    assert (left.info["status"], left.info["steps"], left.info["failure"]["time_s"]) == (how, steps, float(steps))
+    assert left.trains["time_s"].max() == steps - 1.0
+    done, since = runner.resume(tmp_path / "run")
+    run(path, tmp_path / "again", **whole)
+    assert (done.info["status"], since) == ("complete", 0.0)
+    for file in ("trains.parquet", "events.jsonl", "metrics.json"):
+        assert (tmp_path / "run" / file).read_bytes() == (tmp_path / "again" / file).read_bytes()
+    assert sorted(p.name for p in (tmp_path / "run").iterdir()) == sorted(p.name for p in (tmp_path / "again").iterdir())
 
 
 def test_it_drives_by_itself(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """SUMO's own trains: no law of ours. SUMO's ``Rail`` model drives under fixed or under moving block, the baseline to compare with.
 
-SUMO decides on every speed (its default speed mode stays on), we only read: see ``trainctl.sumo.baseline``. Of the scenario it
+SUMO decides on every speed (its default speed mode stays on), we only read: see ``trainctl.watched``. Of the scenario it
 takes the line, the trains with their lengths, places and speeds, and the reroutes; of a SUMO configuration the traffic as it is.
 Masses, resistances and slopes serve to tell what the trains' motion costs; bounds are only watched; links, plant and reference
 play no part, but for the top speed.
@@ -61,6 +61,16 @@ class Params(Table):
         None, ge=0, description="With entry_m: speed at which they enter [m/s]; default as fast as SUMO takes for safe."
     )
     entry_every_s: float = Field(0.0, ge=0, description="With entry_m: the k-th train does not enter before k times this [s].")
+
+
+def signals_m(params: Params, own: float | None) -> float:
+    """Distance of the signals of a line that states its ``own``, or none [m]."""
+    return params.signals_m or own or SIGNALS_M
+
+
+def braking_mps2(params: Params) -> float:
+    """What SUMO brakes these trains with [m/s2]."""
+    return BRAKING_MPS2[params.train_type]
 
 
 def violations(params: Params, scene: Scene) -> list[str]:

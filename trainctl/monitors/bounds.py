@@ -51,9 +51,8 @@ class Alarms:
         self.p = p
         self.watch = on_track.of(p)
         self.waiting = Waiting(p.scenario.ids, p.line.edges, p.driving.wait_limit_s)
-        units = p.plant.UNITS
-        self.watched: tuple[str, ...] = tuple(getattr(p.law, "WATCHED", ())) if units and not p.sampled else ()
-        self.energy = energy.Balance(p) if units else None
+        self.watched: tuple[str, ...] = tuple(getattr(p.law, "WATCHED", ())) if p.has_units and not p.sampled else ()
+        self.energy = energy.Balance(p) if p.has_units else None
 
     def initial(self) -> State:
         """Nothing broken yet."""

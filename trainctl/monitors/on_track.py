@@ -122,11 +122,9 @@ class Watch:
             }  # fmt: skip
 
 
-def of(p: Prepared, line: Line | None = None) -> Watch:
-    """The watch over the trains of a scenario; ``line`` where they run on another one than the scenario's."""
-    net, factor = not p.placed, p.roster.speed_factor
-    rails = Rails.of(line) if line is not None and not net else p.rails
-    return Watch(p.scenario.ids, p.consists.train_length(), factor, rails, line or p.line, net)
+def of(p: Prepared) -> Watch:
+    """The watch over the trains of a scenario."""
+    return Watch(p.scenario.ids, p.consists.train_length(), p.roster.speed_factor, p.rails, p.line, not p.placed)
 
 
 def located(line: Line, net: bool, edge: int, place: float) -> dict[str, Any]:

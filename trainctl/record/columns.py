@@ -65,8 +65,10 @@ UNITS: dict[str, Callable[[Units], Floats]] = {
 
 def trains(row: Row, length: Floats) -> Trains:
     """Gather what the columns of trains are taken from; ``length`` (n,) is that of the trains [m]."""
-    position = row.seen.position
-    return Trains(row, np.where(row.ahead >= 0, position[row.ahead] - position, np.nan), length)
+    position, spacing = row.seen.position, row.spacing
+    if spacing is None:
+        spacing = np.where(row.ahead >= 0, position[row.ahead] - position, np.nan)
+    return Trains(row, spacing, length)
 
 
 def units(row: Row, consists: Consists) -> Units:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -127,6 +127,16 @@ class Prepared:
     def sampled(self) -> bool:
         """Whether the law is evaluated once per control period."""
         return bool(self.law.CLOCK == "sampled")
+
+    @property
+    def self_driven(self) -> bool:
+        """Whether the simulator drives the trains by itself: no law of ours, and no plant."""
+        return bool(self.law.CLOCK == "none")
+
+    @property
+    def has_units(self) -> bool:
+        """Whether every unit of a train moves by itself."""
+        return bool(self.plant.UNITS) and not self.self_driven
 
     @property
     def theta(self) -> float:
@@ -286,7 +296,8 @@ def prepare(
         scenario, trains, net = anew
         network = roster.chart(trains.rails), None, net
     else:
-        network = attempt(_network, scenario, folder)
+        signals_m = partial(law.signals_m, params) if params is not None and hasattr(law, "signals_m") else None
+        network = attempt(_network, scenario, folder, signals_m)
     plan = attempt(_plan, scenario)
     misplaced = placing.on_the_line(scenario, network[0]) if network is not None and trains is None else []
     found += misplaced
@@ -368,7 +379,8 @@ def _params(model: Any, keys: dict[str, Any], table: str) -> Any:
         raise InputError(mistakes(error, keys, table, model)) from None
 
 
-def _network(scenario: Scenario, folder: Path) -> tuple[Line, Any, Path | None]:
+def _network(scenario: Scenario, folder: Path, signals_m: Callable[[float | None], float] | None) -> tuple[Line, Any, Path | None]:
+    """The line, its description and its net; ``signals_m`` is how far apart the law wants signals, from what the line states."""
     network = scenario.network
     if network.net is not None:
         path = folder / network.net
@@ -378,6 +390,9 @@ def _network(scenario: Scenario, folder: Path) -> tuple[Line, Any, Path | None]:
     if name not in known and not name.endswith(".toml"):
         raise InputError(f"network.line = {name}: no such line; known: {', '.join(known)}, or the path of a line .toml")
     spec = sumo_net.read_spec(known.get(name, folder / name))
+    if signals_m is not None:
+        spec = spec.model_copy(update={"signals_m": signals_m(spec.signals_m)})
+        spec = sumo_net.parse_spec(spec.model_dump(mode="json", by_alias=True, exclude_none=True), spec.name)
     return Line.of(spec), spec, None
 
 
@@ -502,7 +517,7 @@ def _fits(p: Prepared) -> list[str]:
             clamp, bound = getattr(p.plant_params, key), getattr(p.scenario.bounds, key)
             if clamp != bound:
                 found.append(f"plant.{key} = {clamp}: must be [bounds] {key} = {bound}, this law's model clamps there")
-    if p.law.CLOCK == "none":
+    if p.self_driven:
         return found + list(p.law.unfit(p.scenario))
     found += [*_messages_fit(p), *_disturbances_fit(p)]
     if p.sampled:

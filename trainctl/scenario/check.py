@@ -49,7 +49,7 @@ def facts(p: Prepared) -> dict[str, Any]:
             found["input_room_mps2"] = [round(float(p.bounds.input_lower.max()), 6), round(float(p.bounds.input_upper.min()), 6)]
     else:
         found["sub_step_s"] = scene.sub_step
-    if p.supervision.mode != "off" and p.law.CLOCK != "none":
+    if p.supervision.mode != "off" and not p.self_driven:
         found["protection"] = promise.told(p)
         found["promise"] = promise.sentences(found["protection"])
     notes = list(p.roster.notes)

@@ -132,7 +132,7 @@ def planned(assumed: Assumed, rate: float) -> Assumed:
 
 def refusals(p: Prepared) -> list[str]:
     """What of the promise cannot be kept in a scenario with ``mode = "on"``, with the numbers that would do."""
-    if p.supervision.mode != "on" or p.law.CLOCK == "none":
+    if p.supervision.mode != "on" or p.self_driven:
         return []
     clamp = p.plant_params.speed_lower_mps if "speed_lower_mps" in p.plant.CLAMPS else None
     if clamp is not None and clamp > 0.0:

@@ -37,15 +37,16 @@ class Journal:
     def __init__(self, folder: Path, p: Prepared, resume: Mapping[str, Any] | None = None) -> None:
         self.p = p
         self.silent = False  # while a run that is resumed begins again
-        self.has_units = p.plant.UNITS
+        self.has_units, self.has_energies = p.has_units, p.has_units or p.self_driven
         watched = tuple(getattr(p.law, "WATCHED", ())) if self.has_units and not p.sampled else ()
         self.watched = watched
         self.extras = p.plant.COLUMNS
         self.disturbances = DISTURBANCES if p.scenario.disturbance else ()
+        self.formed = not (p.placed or p.self_driven)
         tables = standard_tables(
             p.scenario.ids, p.line.track_ids, p.line.edges, units=self.has_units, watched=watched,
             train_extras=(
-                *(ENERGIES if self.has_units else ()), *self.disturbances, *(() if p.placed else ("in_formation",)),
+                *(ENERGIES if self.has_energies else ()), *self.disturbances, *(("in_formation",) if self.formed else ()),
             ),
             unit_extras=self.extras,
         )  # fmt: skip
@@ -71,10 +72,13 @@ class Journal:
         numbers: dict[str, Any] = {name: value(now) for name, value in columns.TRAINS.items()}
         if self.has_units:
             numbers |= self._units(row, here)
+        if self.has_energies:
+            assert row.extremes is not None
+            numbers |= {name: row.extremes.energy[:, q] for q, name in enumerate(ENERGIES)}
         if self.disturbances:
             acting = [np.full(n, np.nan)] * len(self.disturbances) if row.disturbed is None else row.disturbed
             numbers |= dict(zip(self.disturbances, acting, strict=True))
-        if not self.p.placed:
+        if self.formed:
             numbers["in_formation"] = row.led.astype(float)
         numbers |= {"train": np.arange(n), "track": row.track, "edge": row.seen.edge, "saturated": row.saturated}
         if row.seen.present.any():
@@ -100,7 +104,7 @@ class Journal:
         x, finite = now.extremes, columns.finite
         further = {f"{name}_min": finite(x.watched_min[:, q]) for q, name in enumerate(self.watched)}
         further |= {f"{name}_max": finite(x.watched_max[:, q]) for q, name in enumerate(self.watched)}
-        return further | {name: x.energy[:, q] for q, name in enumerate(ENERGIES)}
+        return further
 
     def close(self) -> None:
         """Complete the files."""
@@ -169,9 +173,13 @@ class Record:
             links=formed.links, motion=motion, saturated=demand.saturated if motion is None else demand.saturated | motion.limited,
             extremes=past, disturbed=disturbed, led=formed.led,
         )  # fmt: skip
+        self.tell(row, ways, here, self.due(k), s)
+
+    def tell(self, row: Row, ways: Ways, here: Seen, due: bool, s: State) -> None:
+        """The alarms of one instant, then its row, if one is ``due``."""
         for alarm in self.alarms.new(row, ways, here, s.alarms):
-            self.journal.event(t, "violation", **alarm)
-        if self.due(k):
+            self.journal.event(row.time, "violation", **alarm)
+        if due:
             self.journal.write(row)
 
     def waits(self, t: float, here: Seen, speed: Floats, traffic: Traffic, around: Around, due: Sequence[int], s: State) -> None:

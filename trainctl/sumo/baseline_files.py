@@ -1,4 +1,4 @@
-"""What SUMO is given when it drives by itself, and what it says: net, trains, options, messages."""
+"""What SUMO is given when it drives by itself: trains and options."""
 
 from __future__ import annotations
 
@@ -8,10 +8,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-import sumo_net
-from sumo_net import Line, LineError
-from sumo_net.netfile import content, unpack
-from trainctl.controllers.sumo import SIGNALS_M
+from sumo_net.netfile import content
 from trainctl.errors import InputError
 from trainctl.scenario.build import Prepared
 from trainctl.signals import SPEED, Floats
@@ -42,25 +39,17 @@ class Departure(NamedTuple):
     stops: tuple[Stop, ...]
 
 
-def network(p: Prepared, folder: Path) -> tuple[Line, Path]:
-    """The line with its signals, if it is to have them, and its net in ``folder``.
+def verify_signals(p: Prepared) -> None:
+    """Whether a net that came as a file has the signals that fixed block needs.
 
     Raises
     ------
     InputError
-        The signals cannot stand there, or a net that came as a file has none.
+        It has none.
     """
-    if p.net is not None:
-        if p.params.block == "fixed" and b'type="rail_signal"' not in content(p.net):
-            rule = 'has no rail signals; give it some, or take block = "moving"'
-            raise InputError(f"{p.file}: controller.block = fixed: {p.net.name} {rule}")
-        return p.line, unpack(p.net, folder)
-    spec = p.spec.model_copy(update={"signals_m": p.params.signals_m or p.spec.signals_m or SIGNALS_M})
-    try:
-        spec = sumo_net.parse_spec(spec.model_dump(mode="json", by_alias=True, exclude_none=True), spec.name)
-        return Line.of(spec), sumo_net.build(spec, folder)
-    except LineError as error:
-        raise InputError([f"{p.file}: network: {line}" for line in error.mistakes]) from None
+    if p.net is not None and p.params.block == "fixed" and b'type="rail_signal"' not in content(p.net):
+        rule = 'has no rail signals; give it some, or take block = "moving"'
+        raise InputError(f"{p.file}: controller.block = fixed: {p.net.name} {rule}")
 
 
 def departures(p: Prepared) -> list[Departure]:

@@ -11,7 +11,7 @@ import os
 import re
 import sys
 from collections import deque
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ import numpy as np
 from sumo_net import Line
 from trainctl.errors import CouplingError, SimulatorError
 from trainctl.numeric import lay_out
-from trainctl.railway.ways import rerouted
+from trainctl.railway.ways import Ways, rerouted
 from trainctl.runs.sumo_logs import elements
 from trainctl.signals import Bools, Floats, Ints, Links, Seen, Start
 from trainctl.sumo.preflight import objections
@@ -161,20 +161,80 @@ def collisions(log: Path, ids: Container[str]) -> list[dict[str, Any]]:
     return found
 
 
-class Sumo:
-    """One libsumo simulation. ``folder`` receives SUMO's inputs and its own logs, FCD with rows every ``record_every`` seconds.
+class Session:
+    """One libsumo simulation, from its start to its logs, whoever drives the trains in it.
 
-    ``api`` is the module that talks to SUMO: libsumo, or another with the same functions.
+    ``folder`` receives SUMO's inputs and its own logs, FCD with rows every ``record_every`` seconds. ``api`` is the module that
+    talks to SUMO: libsumo, or another with the same functions.
     """
 
     api: Any = libsumo
-    idle = True  # see IDLE_S
+    ids: Sequence[str]
+    ways: Ways
+    seen: Seen
 
     def __init__(self, line: Line, net: Path, folder: Path, step: float, steps: int, record_every: float | None = None) -> None:
         self.line, self.net, self.folder, self.time_step, self.steps = line, net, folder, step, steps
         self.record_every = record_every
         self.internal = any(edge.startswith(":") for edge in line.edges)
         self.began = False
+
+    def _ready(self) -> None:
+        """Whether SUMO can be started at all."""
+        if libsumo.simulation.isLoaded():
+            raise SimulatorError("SUMO already runs in this process; it can hold one simulation at a time")
+
+    def _launch(self, options: list[str]) -> None:
+        libsumo.start(["sumo", *options])
+
+    def _begin(self, configuration: Path) -> None:
+        """Start SUMO, which then has its first trains on the net."""
+        logs = [part for key, name in LOGS.items() for part in (f"--{key}", str(self.folder / name))]
+        self._call(self._launch, ["-c", str(configuration), *logs])
+        self.began = True
+        self._call(self.api.simulationStep)
+
+    def route(self, train: int, edges: tuple[str, ...]) -> None:
+        """Give a train another route."""
+        self._call(self.api.vehicle.setRoute, self.ids[train], normal(edges))
+        line, row, before = self.line, int(self.seen.row[train]), self.ways.first
+        self.ways = rerouted(self.ways, train, row, [line.index[e] for e in edges], line.start_m, line.length_m)
+        self.seen = self.seen._replace(row=self.seen.row + self.ways.first[:-1] - before[:-1])
+
+    def close(self) -> None:
+        """End the simulation; SUMO then completes its logs."""
+        if self.began:
+            self.began = False
+            self.api.close()
+            torn = [name for key, name in LOGS.items() if key != "log" and not _ended(self.folder / name)]
+            if torn:
+                raise SimulatorError(f"SUMO left {', '.join(torn)} incomplete without a word: is the disk full?")
+
+    def messages(self) -> list[tuple[float | None, str]]:
+        """Warnings and errors SUMO wrote, with the time it named, if any."""
+        found = messages(self.folder / LOGS["log"])
+        return [(at, text) for at, text in found if not text.startswith(OF_IDLING)]
+
+    def collisions(self) -> list[dict[str, Any]]:
+        """Collisions SUMO counted, see ``World``."""
+        return collisions(self.folder / LOGS["collision-output"], self.ids)
+
+    def _time(self) -> float:
+        return float(self.api.simulation.getTime()) - self.time_step
+
+    def _call(self, function: Any, *arguments: Any, **more: Any) -> Any:
+        """Libsumo's own errors in the project's words."""
+        try:
+            return function(*arguments, **more)
+        except (self.api.TraCIException, self.api.FatalTraCIError) as error:
+            where = f" at {self._time():.3f} s" if self.began and libsumo.simulation.isLoaded() else ""
+            raise SimulatorError(f"SUMO{where}: {error}") from None
+
+
+class Sumo(Session):
+    """SUMO behind the loop: trains move by what they are told."""
+
+    idle = True  # see IDLE_S
 
     def start(self, start: Start) -> None:
         """Load the net, insert the trains, verify each of them, and take every speed correction off."""
@@ -194,10 +254,7 @@ class Sumo:
         self.ways = lay_out(self.line, start)
         self.way_end = self._way_end()
         self.coming: list[tuple[int, float]] = []
-        logs = [part for key, name in LOGS.items() for part in (f"--{key}", str(self.folder / name))]
-        self._call(self._launch, ["-c", str(configuration), *logs])
-        self.began = True
-        self._call(self.api.simulationStep)
+        self._begin(configuration)
         everyone = np.flatnonzero(start.present)
         self._verify_insertion(everyone, start.speed[everyone])
         row = self.ways.first[:-1].copy()
@@ -207,14 +264,6 @@ class Sumo:
             with silent():
                 for kind in sorted(set(self.kinds)):
                     self._call(self.api.vehicletype.setActionStepLength, kind, idle_s(self.time_step))
-
-    def _ready(self) -> None:
-        """Whether SUMO can be started at all."""
-        if libsumo.simulation.isLoaded():
-            raise SimulatorError("SUMO already runs in this process; it can hold one simulation at a time")
-
-    def _launch(self, options: list[str]) -> None:
-        libsumo.start(["sumo", *options])
 
     def _verify_insertion(self, trains: Ints, speeds: Floats) -> None:
         """Whether these trains are where they were put; takes every speed correction off them."""
@@ -284,11 +333,8 @@ class Sumo:
 
     def route(self, train: int, edges: tuple[str, ...]) -> None:
         """Give a train another route."""
-        self._call(self.api.vehicle.setRoute, self.ids[train], normal(edges))
-        line, row, before = self.line, int(self.seen.row[train]), self.ways.first
-        self.ways = rerouted(self.ways, train, row, [line.index[e] for e in edges], line.start_m, line.length_m)
+        super().route(train, edges)
         self.way_end = self._way_end()
-        self.seen = self.seen._replace(row=self.seen.row + self.ways.first[:-1] - before[:-1])
 
     def insert(self, train: int, speed: float) -> None:
         """Put a train on the net where it was to start; it is there after the next ``move``."""
@@ -358,35 +404,6 @@ class Sumo:
             f"train {name} on {edge} at {self._time():.3f} s moved {moved:.6f} m, commanded {displacement[i]:.6f} m:"
             f" something else moved it (likely cause: {cause})"
         )
-
-    def close(self) -> None:
-        """End the simulation; SUMO then completes its logs."""
-        if self.began:
-            self.began = False
-            self.api.close()
-            torn = [name for key, name in LOGS.items() if key != "log" and not _ended(self.folder / name)]
-            if torn:
-                raise SimulatorError(f"SUMO left {', '.join(torn)} incomplete without a word: is the disk full?")
-
-    def messages(self) -> list[tuple[float | None, str]]:
-        """Warnings and errors SUMO wrote, with the time it named, if any."""
-        found = messages(self.folder / LOGS["log"])
-        return [(at, text) for at, text in found if not text.startswith(OF_IDLING)]
-
-    def collisions(self) -> list[dict[str, Any]]:
-        """Collisions SUMO counted, see ``World``."""
-        return collisions(self.folder / LOGS["collision-output"], self.ids)
-
-    def _time(self) -> float:
-        return float(self.api.simulation.getTime()) - self.time_step
-
-    def _call(self, function: Any, *arguments: Any, **more: Any) -> Any:
-        """Libsumo's own errors in the project's words."""
-        try:
-            return function(*arguments, **more)
-        except (self.api.TraCIException, self.api.FatalTraCIError) as error:
-            where = f" at {self._time():.3f} s" if self.began and libsumo.simulation.isLoaded() else ""
-            raise SimulatorError(f"SUMO{where}: {error}") from None
 
 
 def _direct(function: Any) -> Any:
