@@ -23,7 +23,7 @@ from judge import Findings, Recording, judge
 
 from trainctl import runner
 from trainctl.errors import InputError, TrainctlError
-from trainctl.loop import Simulation
+from trainctl.loop import Loop
 from trainctl.numeric import Numeric
 from trainctl.scenario.build import Prepared, prepare
 from trainctl.scenario.reading import examine
@@ -455,7 +455,7 @@ def driven(case: Case, mode: str = "on", backend: str = "numeric") -> Outcome:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir()
             world = runner.open_world(p, folder, "sumo")
-        sim = Simulation(p, world, journal)  # type: ignore[arg-type]
+        sim = Loop(p, world, journal)  # type: ignore[arg-type]
         recording.look(sim)
         while sim.k < p.scenario.run.steps:
             sim.step()

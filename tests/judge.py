@@ -55,7 +55,7 @@ class Recording:
     def look(self, sim: Any) -> None:
         """Write down where the fronts are, as the world measures it."""
         seen, ways = sim.world.measure(), sim.world.ways
-        own, heads = sim.own, self.p.heads
+        own, heads = sim.state.own, self.p.heads
         along = seen.position - ways.begin[ways.first[:-1]]
         least = np.minimum.reduceat(own[:, 1], heads)
         self.rows.append((sim.time, along, own[heads, 1].copy(), least, seen.present.copy()))
