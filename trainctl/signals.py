@@ -184,6 +184,10 @@ class SampledLaw(Protocol):
     """A train-level law evaluated once per control period: a module of this shape in ``trainctl.controllers``.
 
     ``demand`` must be local: the input of a train depends on its own rows and on what the links bring it.
+
+    A law that keeps something from one control instant to the next has ``initial(params, scene)``, its state at the first one:
+    arrays and numbers in (named) tuples, one row per train. Its ``demand`` then takes that as the last argument and returns
+    ``(Demand, state)``; it must not write into what it was given. The state lies in the loop's and in every checkpoint.
     """
 
     CLOCK: Literal["sampled"]
@@ -241,6 +245,9 @@ class ContinuousLaw(Protocol):
     def watch(self, i: int, constants: Any, leader: Floats, first: Ints, own: Floats, links: Links, out: Floats) -> None:
         """Write the constrained quantities of train ``i`` into ``out``; here ``own`` is that of all trains (this is a monitor)."""
 
+    def watched_bounds(self, params: Any, scene: Scene) -> tuple[Floats, Floats]:
+        """Lower and upper bounds of the quantities ``watch`` writes, (n, q) each; a law that watches nothing needs none."""
+
 
 class Observer(Protocol):
     """Estimates per unit, integrated with plant and law; compiled like a continuous law.
@@ -268,6 +275,12 @@ class Observer(Protocol):
 
     def rate(self, i: int, constants: Any, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats) -> None:
         """Write d(estimate)/dt into ``out``; ``applied`` [N] is what the limits left of the demand."""
+
+    def fault_estimate(self, constants: Any, estimate: Floats) -> Floats:
+        """What it takes the faults for [m/s3], (U,), for logs; NaN where it estimates none."""
+
+    def acceleration_estimate(self, constants: Any, estimate: Floats) -> Floats:
+        """Estimated acceleration [m/s2], (U,), for logs; NaN where it estimates none."""
 
 
 class Plant(Protocol):

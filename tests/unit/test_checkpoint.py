@@ -21,7 +21,6 @@ from trainctl.record.folder import claim, free, held, ours, remove, write_info
 from trainctl.runner import again, begin
 from trainctl.scenario.build import open_scenario
 from trainctl.signals import Demand, Start
-from trainctl.stages.record import Journal
 
 
 class Deaf(Numeric):
@@ -125,8 +124,8 @@ class Unheard:
         pass
 
 
-#: Where everything is told, and what only the user sets.
-OUTSIDE = {"world", "journal", "between"}
+#: The scenario, where everything is told, and what only the user sets.
+OUTSIDE = {"p", "world", "journal", "between"}
 
 #: What a stage may overwrite: written anew in every step before it is read, or made of the world's ways.
 WORK_SPACE = {
@@ -156,16 +155,14 @@ def remembered(name, thing):
 
 
 def beside(loop):
-    """What the parts of a loop hold that is no work space: all but its state."""
-    found = {}
+    """What the parts of a loop hold that is no work space, and the scenario's arrays: all but the loop's state."""
+    found = dict(remembered("p", (loop.p.own, loop.p.consists, loop.p.bounds, loop.p.reference, loop.p.first_links)))
     for stage, thing in vars(loop).items():
         if stage in OUTSIDE | {"state"}:
             continue
-        places = [stage] if stage in ("p", "not_entered") else [f"{stage}.{key}" for key in vars(thing)]
-        for place in places:
-            _, _, key = place.partition(".")
-            if key not in OUTSIDE | {"p"} | WORK_SPACE.get(stage, set()):
-                found |= dict(remembered(place, getattr(thing, key) if key else thing))
+        for key, part in vars(thing).items() if hasattr(thing, "__dict__") else [("", thing)]:
+            if key not in OUTSIDE | WORK_SPACE.get(stage, set()):
+                found |= dict(remembered(f"{stage}.{key}", part))
     return found
 
 
@@ -201,7 +198,8 @@ CHANGED = {
 
 
 def lost(expected, found):
-    return [place for place in expected | found if not same(expected.get(place), found.get(place))]
+    both = expected.keys() & found.keys()
+    return [place for place in expected | found if place not in both or not same(expected[place], found[place])]
 
 
 def from_checkpoint(p, folder):
@@ -248,7 +246,7 @@ def test_a_stage_that_keeps_something_to_itself_is_found_out():
     made = beside(loop)
     assert {"control.clamps", "orders.theta", "record.track_of", "protect.disturbing"} <= made.keys()
     for stage, thing in (("control", 3), ("driver", [1.0]), ("protect", {"x": np.zeros(2)}), ("record", None)):
-        setattr(getattr(loop, stage), "hidden", thing)
+        getattr(loop, stage).hidden = thing
         assert any(place.startswith(f"{stage}.hidden") for place in lost(made, beside(loop))), stage
 
 

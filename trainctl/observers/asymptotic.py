@@ -262,6 +262,11 @@ def fault_estimate(constants: Constants, estimate: Floats) -> Floats:
     return total
 
 
+def acceleration_estimate(constants: Constants, estimate: Floats) -> Floats:
+    """Estimated acceleration of every unit [m/s2], for logs."""
+    return estimate[:, W]
+
+
 @inlined(inline="always")
 def own_coefficient(unit: Floats, v: float) -> float:
     """B1 of eq. (4): how the acceleration of a unit damps itself at this speed [1/s]."""

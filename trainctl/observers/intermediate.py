@@ -148,3 +148,8 @@ def rate(i: int, constants: Constants, own: Floats, estimate: Floats, correction
 def fault_estimate(constants: Constants, estimate: Floats) -> Floats:
     """f'_hat of every unit [m/s3], for logs."""
     return estimate[:, XI] + constants.kappa * estimate[:, W]
+
+
+def acceleration_estimate(constants: Constants, estimate: Floats) -> Floats:
+    """Estimated acceleration of every unit [m/s2], for logs."""
+    return estimate[:, W]

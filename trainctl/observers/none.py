@@ -50,3 +50,13 @@ def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out:
 @inlined()
 def rate(i: int, constants: Constants, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats) -> None:
     """Nothing to estimate."""
+
+
+def fault_estimate(constants: Constants, estimate: Floats) -> Floats:
+    """None known, shape (U,)."""
+    return np.full(len(estimate), np.nan)
+
+
+def acceleration_estimate(constants: Constants, estimate: Floats) -> Floats:
+    """None known, shape (U,)."""
+    return np.full(len(estimate), np.nan)

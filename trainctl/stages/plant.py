@@ -311,7 +311,7 @@ class Units:
             "fault_mps3": actuated_units.fault(self.plant, t, demanded),
             "fault_estimate_mps3": self.p.observer.fault_estimate(loop.observer, estimate),
             "acceleration_mps2": rate[:, SPEED],
-            "acceleration_estimate_mps2": estimate[:, self.p.law.W],
+            "acceleration_estimate_mps2": self.p.observer.acceleration_estimate(loop.observer, estimate),
         }
 
     def _pieces(self, t: float) -> list[tuple[float, int]]:
