@@ -147,10 +147,10 @@ def _blind(self, speed, acceleration, around, traffic, formed, commanded):
     return Driven(np.zeros(self.n), np.zeros(self.n, bool)), formed
 
 
-def _let_in(self, t, ways, here, speed, s):
+def _let_in(self, t, ways, here, speed, s, due):
     """Everybody comes at his time, whoever has the track."""
     s, held = self._claim(t, ways, here, speed, np.zeros(len(speed), bool), s)
-    come = tuple((i, 35.0) for i in self.due(t, s))
+    come = tuple((i, 35.0) for i in due)
     came = s.came.copy()
     for i, v in come:
         came[i], speed[i] = True, v

@@ -64,6 +64,8 @@ class Pair:
         self.state, self.formed, self.own, self.seen, links = self.rule.step(
             t, self.seen, self.own, at, self.traffic, self.state, self.formed
         )
+        if links is not None:
+            self.formed = self.formed._replace(links=links)  # as ``topology`` does
         return links
 
 

@@ -75,7 +75,7 @@ def test_limits_stops_and_trains_ahead_are_braked_for(p):
             cab.step(stops=([1], [distance])),
             cab.step(cab.alone(targets=target(1, distance + p.driver_rules.margin_m, 0.0, TRAIN, other=0))),
         ):
-            assert (driven.ordered[1] < -0.5 * plan) is brakes
+            assert bool(driven.ordered[1] < -0.1) is brakes
             np.testing.assert_allclose(np.delete(driven.ordered, 1), 0.0)
 
 
@@ -99,7 +99,8 @@ def test_a_train_that_stands_at_a_stop_is_held_and_so_is_one_that_may_not_go(p):
 
 
 def test_a_train_in_no_formation_is_commanded_like_any_other(p):
-    cab, wanted = Cab(p), np.full(8, np.nan)
+    cab = Cab(p)
+    wanted = np.full(cab.n, np.nan)
     wanted[3] = -0.3
     driven, _ = cab.step(commanded=wanted)
     assert driven.ordered[3] == -0.3
