@@ -69,7 +69,7 @@ def test_limits_stops_and_trains_ahead_are_braked_for(p):
     plan = p.driver_rules.service_mps2
     near = 0.5 * 35.0**2 / plan
     cab = Cab(p)
-    for distance, brakes in ((1.05 * near, True), (1.6 * near, False)):
+    for distance, brakes in ((near, True), (1.6 * near, False)):
         for driven, _ in (
             cab.step(cab.alone(limits=Limits(np.array([1]), np.array([distance - 20.0]), np.array([1.0])))),
             cab.step(stops=([1], [distance])),
