@@ -75,7 +75,7 @@ def behind(p: Prepared, edge: int) -> int:
     """The edge before another one, if that is certain; -1: there is none, or several."""
     rails = p.rails
     found = [e for e in rails.before[edge] if (e, edge) not in rails.reversal]
-    if p.roster is None:  # tracks of a line go straight on, crossovers come in from the side
+    if p.placed:  # tracks of a line go straight on, crossovers come in from the side
         over = {rails.index[c.edge] for c in p.line.crossovers}
         found = [e for e in found if e not in over and p.line.tracks[e] == p.line.tracks[edge]]
     return found[0] if len(found) == 1 else -1

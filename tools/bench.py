@@ -34,6 +34,8 @@ this checkout over the other, with the least and the greatest. Closing the logs 
 ``--instructions`` counts instead of measuring: instructions per train and step, by valgrind, which must be installed. They are no
 times (a cache miss is not seen), but the same whatever else the machine does: they tell whether a change made anything cheaper.
 Nothing is closed, and SUMO behind TraCI is not counted.
+
+``--logs`` measures how fast logs are read instead (``tools/bench_logs.py``).
 """
 
 from __future__ import annotations
@@ -74,7 +76,7 @@ WORK = {
 IN_SUMO_WORK = 120_000
 
 #: Steps before those that are measured: until then all trains have come.
-BEFORE = {"traffic": 120}
+BEFORE = {"traffic": 160}
 
 #: Steps of the two runs whose instructions are compared; in between, the recorder writes at 1000 trains what 66 steps hold.
 COUNTED = (10, 76)
@@ -124,7 +126,7 @@ PER_PIECE, BRANCH_M, TRUNK_M = 8, 6000.0, 40_000.0
 
 
 def railway(folder: Path, trains: int) -> None:
-    """Pieces of railway beside each other: in each, two branches merge, and trains come on both every 20 s."""
+    """Pieces of railway beside each other: in each two branches merge; trains come far enough apart to enter at once."""
     from sumo_net.build import program
 
     nodes, edges, came = [], [], []
@@ -136,7 +138,7 @@ def railway(folder: Path, trains: int) -> None:
             edges.append(f'<edge id="{name}{k}" from="{begin}{k}" to="{end}{k}" numLanes="1" speed="40" allow="rail"/>')
     for i in range(trains):
         k, turn = divmod(i, PER_PIECE)
-        branch, depart = ("west", "south")[turn % 2], 20.0 * (turn // 2) + 7.0 * (turn % 2)
+        branch, depart = ("west", "south")[turn % 2], 40.0 * (turn // 2) + 20.0 * (turn % 2)
         came.append((depart, i, f'<route edges="{branch}{k} trunk{k}"/>'))
     body = "".join(f'<vehicle id="{i}" type="emu" depart="{t}" departSpeed="max">{way}</vehicle>' for t, i, way in sorted(came))
     kind = '<vType id="emu" vClass="rail" length="100" maxSpeed="45"/>'
@@ -712,6 +714,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, help="repeats of each case, default 3; of pairs, default 10; the median is told")
     parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="compare with the code there; default 1000 trains")
     parser.add_argument("--instructions", action="store_true", help="count instructions with valgrind: repeatable, but slow")
+    parser.add_argument("--logs", type=float, nargs="?", const=40.0, metavar="MB", help="how fast logs of this size are read")
     parser.add_argument("--json", action="store_true", help="print a list of rows for machines")
     parser.add_argument("--case", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--public", nargs=3, help=argparse.SUPPRESS)
@@ -727,6 +730,12 @@ def main() -> None:
         case, folder, checkout = asked.public
         of_this(Path(checkout))
         child(case, Path(folder), public)
+    elif asked.logs is not None:
+        import bench_logs
+
+        with tempfile.TemporaryDirectory(prefix="trainctl-bench-") as root:
+            rows = bench_logs.logs(Path(root), asked.logs, asked.repeats)
+        print(json.dumps(rows, indent=2) if asked.json else bench_logs.table(rows))
     else:
         with tempfile.TemporaryDirectory(prefix="trainctl-bench-") as root:
             sizes, cases = asked.trains or list(SIZES), asked.only

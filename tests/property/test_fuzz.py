@@ -10,13 +10,10 @@ import datetime
 import gzip
 import json
 import math
-import resource
 import shutil
-import signal
 import tomllib
-from contextlib import contextmanager
 from functools import cache
-from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -25,50 +22,21 @@ import tomli_w
 import yaml
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from limits import bounded
 
 import sumo_net
-from sumo_net import Line, LineError
+from sumo_net import Line
 from sumo_net.importing import Options, convert
+from trainctl.diff.page import page
+from trainctl.diff.results import junit
 from trainctl.diff.runs import diff
-from trainctl.errors import InputError
+from trainctl.diff.tolerance import parse_tolerances
 from trainctl.metrics.run import metrics
 from trainctl.metrics.traffic import metrics_of_fcd
 from trainctl.runs.run import Run
 from trainctl.scenario.build import open_scenario
 from trainctl.scenario.check import facts
 from trainctl.scenario.reading import read, shipped
-
-#: No example may take more processor time than this [s], nor more memory beyond what the test began with.
-LIMIT_S, LIMIT_BYTES = 20.0, 1 << 30
-
-
-class Hang(BaseException):
-    """Not an Exception, so that nothing swallows it."""
-
-
-@contextmanager
-def bounded():
-    """Only mistakes in words may leave; processor time and memory are limited."""
-
-    def stop(*_):
-        raise Hang(f"more than {LIMIT_S} s of processor time")
-
-    data = next(int(line.split()[1]) << 10 for line in Path("/proc/self/status").read_text().splitlines() if "VmData" in line)
-    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    before = signal.signal(signal.SIGPROF, stop)
-    resource.setrlimit(resource.RLIMIT_DATA, (data + LIMIT_BYTES, hard))
-    signal.setitimer(signal.ITIMER_PROF, LIMIT_S)
-    try:
-        yield
-    except (InputError, LineError) as error:
-        assert error.mistakes
-        for line in error.mistakes:
-            assert line.isprintable() and line.strip(), line
-    finally:
-        signal.setitimer(signal.ITIMER_PROF, 0)
-        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
-        signal.signal(signal.SIGPROF, before)
-
 
 # Values and trees
 
@@ -284,12 +252,22 @@ def write_mutated(data, file, target):
     pq.write_table(table, target)
 
 
+def compared(a, b):
+    """Compare in both ways, and put the findings into words."""
+    for tolerances in (None, parse_tolerances({"time_s": 1.5, "range": 0.01})):
+        report = diff(a, b, tolerances)
+        json.dumps(report.as_dict())
+        ET.fromstring(junit(report))
+        page(report)
+        assert report.same or report.findings
+
+
 def fuzz_log(data, place, sumo):
     """diff of a log with its mutation; metrics of an FCD log."""
     file = sumo[data.draw(st.sampled_from(sorted(sumo)))]
     target = mutated_log(data, file, place)
     with bounded():
-        diff(file, target)
+        compared(file, target)
     with bounded():
         metrics_of_fcd(target)
 
@@ -317,7 +295,7 @@ def fuzz_run(data, place, sumo):
     else:
         file.write_bytes(data.draw(scarred(file.read_bytes())))
     with bounded():
-        diff(whole, copied)
+        compared(whole, copied)
     with bounded():
         metrics(Run(copied))
 

@@ -106,3 +106,13 @@ def test_one_command_measures_side_by_side():
     parts = sum(rows["loop"][f"{part}_us"] for part in bench.PARTS)
     assert 0.5 * rows["loop"]["us_per_train_step"] < parts <= 1.01 * rows["loop"]["us_per_train_step"]
     assert all(row["peak_mb"] > 10 for row in rows.values())
+
+
+def test_reading_logs_is_measured_beside_the_bare_parser():
+    command = [sys.executable, FILE, "--logs", "0.5", "--repeats", "1", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    rows = {row["case"]: row for row in json.loads(done.stdout)}
+    assert list(rows) == ["regular", "few", "persons", "irregular", "strict", "one_line", "diff"]
+    assert rows["regular"]["ratio_to_bare"] > 2 * rows["strict"]["ratio_to_bare"]
+    assert rows["diff"]["mb"] == pytest.approx(2 * rows["regular"]["mb"], rel=0.1)

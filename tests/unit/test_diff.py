@@ -312,7 +312,7 @@ def test_tolerances_of_a_file(tmp_path):
 
 @pytest.mark.parametrize("table, words", [
     ({"columns": {"speed": -1}}, "columns.speed = -1: must be a number, at least 0"),
-    ({"columns": {"speed": {"absolut": 1}}}, "columns.speed.absolut = 1: must be absolute, relative or ignore"),
+    ({"columns": {"speed": {"absolut": 1}}}, "columns.speed.absolut = 1: must be absolute, relative, range, time_s, time_relative, time_range or ignore"),
     ({"absolute": "1"}, "absolute = 1: must be a number"),
     ({"collumns": {}}, "collumns: unknown key"),
     ({"columns": 3}, "columns = 3: must be a table"),

@@ -113,7 +113,7 @@ with open(sys.argv[1], "w") as f:
 MEASURE = """
 import re, sys
 from pathlib import Path
-from trainctl.record.diff import diff
+from trainctl.diff.runs import diff
 assert diff(sys.argv[1], sys.argv[2]).same
 status = Path("/proc/self/status").read_text()  # ru_maxrss is at least that of the process that started this one
 print(int(re.search(r"VmHWM:\\s+(\\d+)", status)[1]) // 1024)

@@ -1,7 +1,8 @@
 """Every command and snippet of the pages is executed, in the order of the page, as a reader would.
 
 ``sh`` blocks line by line, ``python`` blocks in one namespace per page, ``toml`` blocks are written to the file their first line
-names (``xml`` blocks too). Lines that take too long or need a screen or a network are replaced: REPLACED says by what and why.
+names (``xml`` blocks too, and ``python`` blocks whose first line is a file's name). Jobs of a CI (``yaml``) are executed but for what
+needs a package index. Lines that take too long or need a screen or a network are replaced: REPLACED says by what and why.
 """
 
 from __future__ import annotations
@@ -17,14 +18,23 @@ from pathlib import Path
 import matplotlib
 import pytest
 import typer
+import yaml
 
 import sumo_net
 from trainctl.cli import program as cli
+from trainctl.diff.tolerance import read_tolerances
 from trainctl.scenario.build import open_scenario
 from trainctl.studies import sweep
 
 ROOT = Path(__file__).parents[2]
-PAGES = ("README.md", "scenarios/README.md", "sumo_net/README.md", "sumo_net/OSM.md", "trainctl/controllers/README.md")
+PAGES = (
+    "README.md",
+    "scenarios/README.md",
+    "sumo_net/README.md",
+    "sumo_net/OSM.md",
+    "trainctl/controllers/README.md",
+    "trainctl/diff/README.md",
+)
 
 #: Line of a page -> (what is executed instead, why). None: not executed.
 REPLACED: dict[str, tuple[str | None, str]] = {
@@ -91,6 +101,14 @@ def typed(line: str, monkeypatch: pytest.MonkeyPatch) -> int:
     return int(end.value.code or 0)
 
 
+def steps(text: str) -> list[str]:
+    """Commands of a CI's job, GitHub's or GitLab's."""
+    found = yaml.safe_load(text)
+    if "jobs" in found:
+        return [step["run"] for job in found["jobs"].values() for step in job["steps"] if "run" in step]
+    return [line for job in found.values() for line in job["script"]]
+
+
 def checked(text: str, folder: Path) -> None:
     """A scenario without mistakes, a line, a sweep, or a piece of another file; written down for the commands that follow."""
     comment, name = re.match(r"# (part of )?([\w/]+\.toml)\n", text), "block.toml"
@@ -100,7 +118,9 @@ def checked(text: str, folder: Path) -> None:
     if comment:
         name = comment[2]
     (folder / name).write_text(text)
-    if "tracks" in tomllib.loads(text):
+    if name == "tolerances.toml":
+        read_tolerances(folder / name)
+    elif "tracks" in tomllib.loads(text):
         sumo_net.read_spec(folder / name)
     elif "scenario" in tomllib.loads(text):
         plan = sweep.ready_made(str(folder / name))
@@ -124,12 +144,20 @@ def test_every_block_of_the_page_runs(page, tmp_path, monkeypatch, capfd):
             elif language == "python" and text.startswith("def demand("):
                 law = (ROOT / "trainctl/templates/my_law.py").read_text()
                 assert text.partition("\n")[2].replace("  # spacing error of every link [m]", "").strip() in law
+            elif language == "python" and (file := re.match(r"# (\S+\.py)\n", text)):
+                (tmp_path / file[1]).write_text(text)
+            elif language == "yaml":
+                for line in steps(text):
+                    if "pip install" not in line:
+                        assert typed(line, monkeypatch) == 0, f"{line}: {capfd.readouterr().err}"
             elif language == "python":
                 exec(compile(text, page, "exec"), names)
             elif language == "toml":
                 checked(text, tmp_path)
             elif language == "xml":
                 (tmp_path / re.match(r"<!-- (\S+) -->\n", text)[1]).write_text(text)
+            elif language == "text":
+                pass  # what a command prints
             else:
                 raise AssertionError(f"{page}: a block in {language}: how is it executed?")
     if page == "sumo_net/OSM.md":

@@ -306,7 +306,7 @@ def fcd_files(folder: Path) -> list[Path]:
 
 def test_any_kind_of_fcd_gives_the_same_metrics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for batch_rows in (65536, 2, 1):
-        monkeypatch.setattr("trainctl.runs.sumo_logs.BATCH_ROWS", batch_rows)
+        monkeypatch.setattr("trainctl.runs.xml_rows.BATCH_ROWS", batch_rows)
         for path in fcd_files(tmp_path):
             values = metrics_of_fcd(path)
             assert {name: pytest.approx(value) for name, value in values.items()} == {
@@ -323,10 +323,10 @@ BOMB = '<!DOCTYPE x [<!ENTITY a "lol"><!ENTITY b "&a;&a;&a;">]><fcd-export><time
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"", "no column"),
+        (b"", "no vehicle"),
         (b"hello", "no column"),
         (b"\xff\xfe\x00garbage", "no column"),
-        (b"PAR1 but no more", "not an FCD log"),
+        (b"PAR1 but no more", "not a complete Parquet file"),
         (b"\x1f\x8b\x08 damaged", "damaged gzip"),
         (gzip.compress(FCD.encode())[:-30], "damaged gzip"),
         (BOMB.encode(), "document type or entities"),
@@ -336,11 +336,11 @@ BOMB = '<!DOCTYPE x [<!ENTITY a "lol"><!ENTITY b "&a;&a;&a;">]><fcd-export><time
         (FCD.replace('"10"', '"nan"').encode(), "not finite"),
         (FCD.replace("2.00", "-2.00").encode(), "does not ascend"),
         (b'<fcd-export><timestep time="0"/></fcd-export>', "no vehicle"),
-        (b"<fcd-export><timestep/></fcd-export>", "without a time"),
+        (b'<fcd-export><timestep><vehicle id="a" speed="1"/></timestep></fcd-export>', "outside any timestep with a time"),
         (b'<fcd-export><timestep time="0"><vehicle id="a"/></timestep></fcd-export>', "without id or speed"),
         (b'<?xml version="1.0" encoding="nonsense"?><fcd-export/>', "nonsense|unknown encoding"),
-        (CSV.replace("120", "much").encode(), "not an FCD log"),
-        (b"timestep_time;vehicle_id;vehicle_speed\n0;a\xff;1\n", "not an FCD log"),
+        (CSV.replace("120", "much").encode(), "pos = much: not a number"),
+        (b"timestep_time;vehicle_id;vehicle_speed\n0;a\xff;1\n", "not a CSV log"),
     ],
 )
 def test_garbage_gives_one_clear_line(tmp_path: Path, content: bytes, words: str) -> None:

@@ -15,7 +15,8 @@ import pytest
 from sumo_net.build import program
 from trainctl.errors import InputError
 from trainctl.scenario.tables import TrainType
-from trainctl.traffic.kinds import Kind, train_type
+from trainctl.scenario.train_types import train_type
+from trainctl.traffic.kinds import Kind
 from trainctl.traffic.read import Traffic, read_traffic
 
 NODES = """<nodes><node id="a" x="0" y="0"/><node id="b" x="2000" y="0"/><node id="c" x="4000" y="0"/><node id="d" x="7000" y="0"/>

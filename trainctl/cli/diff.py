@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -12,9 +12,25 @@ from trainctl.errors import InputError
 if TYPE_CHECKING:
     from trainctl.diff.runs import Report, Tolerances
 
-Log = Annotated[
-    Path, typer.Argument(help="Run folder, or a log of SUMO's: fcd, tripinfo, summary, statistics, collisions, vehroute.")
+#: Rows behind a finding that ``--rows`` shows.
+ROWS = 20
+
+Reference = Annotated[Path, typer.Argument(help="The reference: a run folder, a golden, a log of SUMO's or a folder of these.")]
+Other = Annotated[Path, typer.Argument(help="What is compared with it, of the same kind.")]
+TolerancesFile = Annotated[
+    Path | None,
+    typer.Option("--tolerances", metavar="FILE", help="TOML: tolerances in value and time, of all and of single columns."),
 ]
+Absolute = Annotated[float | None, typer.Option("--tolerance", metavar="X", help="Absolute tolerance of every column.")]
+InTime = Annotated[
+    float | None, typer.Option("--time-tolerance", metavar="S", help="Tolerance in time of every column and of rows, in seconds.")
+]
+Zero = Annotated[bool, typer.Option("--zero", help="No tolerance: --tolerance 0.")]
+Form = Annotated[Literal["text", "json", "github"], typer.Option("--format", help="A table, JSON, or annotations for GitHub.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for machines: --format json.")]
+Rows = Annotated[bool, typer.Option("--rows", help=f"Also the rows behind each finding ({ROWS} each), and every column.")]
+Junit = Annotated[Path | None, typer.Option(metavar="FILE", help="Also write JUnit XML: a test case for every column.")]
+Html = Annotated[Path | None, typer.Option(metavar="FILE", help="Also write one page with the curves and their tubes.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -22,76 +38,127 @@ def register(app: typer.Typer) -> None:
 
     @app.command()
     def diff(
-        a: Log,
-        b: Log,
-        tolerances: Annotated[
-            Path | None, typer.Option(metavar="FILE", help="TOML: absolute, relative, and [columns] with their own.")
-        ] = None,
-        tolerance: Annotated[float | None, typer.Option(metavar="X", help="Absolute tolerance of every column.")] = None,
-        zero: Annotated[bool, typer.Option("--zero", help="No tolerance: --tolerance 0.")] = False,
-        as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")] = False,
+        a: Reference,
+        b: Other,
+        tolerances: TolerancesFile = None,
+        tolerance: Absolute = None,
+        time_tolerance: InTime = None,
+        zero: Zero = False,
+        form: Form = "text",
+        as_json: AsJson = False,
+        rows: Rows = False,
+        junit: Junit = None,
+        html: Html = None,
+        accept: Annotated[bool, typer.Option("--accept", help="Put B in the place of A, after showing what moves.")] = False,
     ) -> None:
         """Compare two runs or two of SUMO's logs (XML, CSV, Parquet, gzipped or not): exit 1 if they differ.
 
-        Rows are matched by time and train. Versions are told but are no difference; SUMO's headers, clocks and durations are not
+        Differences are grouped by train and cause. Rows are matched by time and train; with a tolerance in time a value must lie in
+        the tube round the reference. Versions are told but are no difference; SUMO's headers, clocks and durations are not
         compared. Without options values may differ by 1e-6, or by one in the last decimal of a log.
         """
-        from trainctl.diff.runs import diff as compare
+        chosen = chosen_tolerances(tolerances, 0.0 if zero else tolerance, time_tolerance)
+        compared(a, b, chosen, "json" if as_json else form, rows, junit, html, accept)
 
-        report = compare(a, b, _chosen(tolerances, 0.0 if zero else tolerance))
-        if as_json:
-            from trainctl.cli.console import show_json
 
-            show_json(report.as_dict())
-        else:
-            _show(report)
+def compared(
+    a: Path, b: Path, tolerances: Tolerances, form: str, rows: bool, junit: Path | None, html: Path | None, accept: bool
+) -> None:
+    """Compare, show, write what was asked for, and end with the exit code."""
+    from trainctl.diff.golden import accept as put
+    from trainctl.diff.results import github, write
+    from trainctl.diff.results import junit as results
+    from trainctl.diff.runs import diff as compare
+
+    report = compare(a, b, tolerances)
+    if form == "json":
+        from trainctl.cli.console import show_json
+
+        show_json(report.as_dict())
+    elif form == "github":
+        print("\n".join(github(report)))
+    else:
+        _show(report, rows)
+    if junit is not None:
+        write(junit, results(report))
+    if html is not None:
+        from trainctl.diff.page import page
+
+        write(html, page(report))
+    if accept:
         if not report.same:
-            raise typer.Exit(1)
+            put(a, b)
+        if form == "text":
+            print(f"nothing to accept: {a} stays" if report.same else f"accepted: {a} is what {b} was")
+    elif not report.same:
+        raise typer.Exit(1)
 
 
-def _chosen(file: Path | None, absolute: float | None) -> Tolerances:
-    from trainctl.diff.runs import Tolerance, Tolerances, read_tolerances
+def chosen_tolerances(file: Path | None, absolute: float | None, time_s: float | None) -> Tolerances:
+    """Tolerances of a file, and what the options say instead."""
+    from dataclasses import replace
 
-    read = read_tolerances(file) if file is not None else Tolerances()
-    if absolute is None:
-        return read
-    if not 0 <= absolute < float("inf"):
-        raise InputError(f"--tolerance {absolute}: must be a number, at least 0")
-    return Tolerances(Tolerance(absolute, stated=True), read.columns)
+    from trainctl.diff.tolerance import TIMES, Tolerance, Tolerances, read_tolerances
+
+    found = read_tolerances(file) if file is not None else Tolerances()
+    wrong = [
+        f"{name} {value}: must be a number, at least 0"
+        for name, value in (("--tolerance", absolute), ("--time-tolerance", time_s))
+        if value is not None and not 0 <= value < float("inf")
+    ]
+    if wrong:
+        raise InputError(wrong)
+    if time_s is not None:
+        old, new = ({name: getattr(time, name) for name in TIMES} for time in (found.time, Tolerance(0.0, time_s=time_s)))
+        # columns with a word of their own on time keep it
+        columns = {
+            name: t._replace(**new) if old == {key: getattr(t, key) for key in TIMES} else t for name, t in found.columns.items()
+        }
+        found = replace(found, time=Tolerance(0.0, time_s=time_s), columns=columns)
+    if absolute is not None:
+        found = replace(found, everywhere=Tolerance(absolute, stated=True))
+    return found
 
 
-def _show(report: Report) -> None:
-    from trainctl.cli.console import listing, show
-    from trainctl.diff.runs import at, told
+def _show(report: Report, rows: bool) -> None:
+    from trainctl.diff.behind import rows_behind
+    from trainctl.diff.runs import told
 
     for note in report.notes:
         print(f"note: {note}")
-    rows = sum(t.rows for t in report.tables)
+    count = sum(t.rows for t in report.tables)
     if report.same:
-        print(f"no difference in {rows} rows of {', '.join(t.table for t in report.tables)}")
+        print(f"no difference in {count} rows of {', '.join(t.table for t in report.tables)}")
         return
     if report.first:
         print(f"first difference: {report.first}")
-    for key, x, y in report.settings:
-        print(f"{key}: {x} -> {y}")
-    for old, new in report.renamed.items():
-        print(f"renamed: {old} -> {new}")
-    for line in report.files:
-        print(line)
-    for t in report.tables:
-        for found, side in ((t.missing, "A"), (t.extra, "B")):
-            if found.count:
-                print(f"{t.table}: {found.count} rows only in {side}, first {at(found.first_time_s, found.first_who)}")
-        for name in t.lost_columns:
-            print(f"{t.table}.{name}: column only in A")
-    table = listing(None, "column", "rows", "first at", "most at", "A -> B")
+    print(f"{len(report.findings)} finding{'s' if len(report.findings) > 1 else ''} in {count} compared rows:")
+    for number, f in enumerate(report.findings, 1):
+        print(f"{number:3}. {f.words}{f'  [{f.where}]' if f.where else ''}")
+        for label, d in (("first", f.first), ("most", f.largest)):
+            if d is not None:
+                time = "" if d.place.time_s is None else f"{d.place.time_s:.10g} s, "
+                print(f"       {label}: {time}{d.place.who}: {d.column} {told(d.place)}".replace(", : ", ": "))
+        for row in rows_behind(f, report.tables, report.tolerances, ROWS) if rows else ():
+            time = "" if row.time_s is None else f"{row.time_s:.10g} s, "
+            what = f"{row.column} {row.a} -> {row.b}" if row.column else f"row only in {'A' if row.a else 'B'}"
+            print(f"       {row.table}: {time}{row.who}: {what}")
+    if rows:
+        _columns(report)
+
+
+def _columns(report: Report) -> None:
+    from trainctl.cli.console import listing, show
+    from trainctl.diff.runs import at, told
+
+    table = listing(None, "column", "rows", "tolerance", "first at", "most at", "A -> B")
     for t in report.tables:
         for c in t.columns.values():
             most, first = c.largest or c.first, c.first
             if most is None or first is None:
                 continue
             table.add_row(
-                f"{t.table}.{c.column}", f"{c.differing} of {t.rows}", at(first.time_s, first.who),
+                f"{t.table}.{c.column}", f"{c.differing} of {t.rows}", c.tolerance.told(), at(first.time_s, first.who),
                 at(most.time_s, most.who), told(most),
             )  # fmt: skip
     if table.row_count:

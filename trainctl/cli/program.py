@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from trainctl.cli import diff, extend, net, report, resume, sweep
+from trainctl.cli import diff, extend, golden, net, report, resume, sweep
 from trainctl.cli.console import (
     DEFAULT_SCENARIO,
     Json,
@@ -249,6 +249,7 @@ def _options(
 
 diff.register(app)
 extend.register(app)
+golden.register(app)
 net.register(networks)
 report.register(app)
 resume.register(app)

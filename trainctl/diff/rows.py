@@ -9,15 +9,17 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
-from trainctl.diff.sources import NAMES, Log
+from trainctl.diff.columns import Compared, differing, filled
+from trainctl.diff.feed import Feed, repeats, windows
+from trainctl.diff.in_time import InTime, Judged, Piece, Spans
+from trainctl.diff.sources import Log
+from trainctl.diff.tally import Evidence, Presence, Tally
 from trainctl.diff.tolerance import CLOCKS, Tolerance, Tolerances
-from trainctl.errors import InputError
 from trainctl.signals import Bools, Floats, Ints
 
-#: Rows of one instant, or of a log without times, may not need more than this [bytes].
-INSTANT_BYTES = 1 << 27
+#: Of so many trains the first texts that differ are kept.
+NAMED_TEXTS = 1000
 #: So many new names of one instant are tried for being an old one's.
 CANDIDATES = 100
 
@@ -31,6 +33,9 @@ class Place:
     a: float | str | None
     b: float | str | None
     difference: float | None  # None for texts
+    #: Ends of the tube there, if the column has a tolerance in time.
+    lower: float | None = None
+    upper: float | None = None
 
 
 @dataclass
@@ -65,6 +70,17 @@ class TableDiff:
     lost_columns: list[str] = field(default_factory=list)  # only in A
     new_columns: list[str] = field(default_factory=list)  # only in B
     compared: set[str] = field(default_factory=set)
+    #: For a closer look: figures by column and train, rows by train that only one log has, the rows themselves.
+    trains: list[str] = field(default_factory=list)
+    tallies: dict[str, Tally] = field(default_factory=dict)
+    all_a: Presence = field(default_factory=Presence)
+    all_b: Presence = field(default_factory=Presence)
+    only_a: Presence = field(default_factory=Presence)
+    only_b: Presence = field(default_factory=Presence)
+    rows_a: Evidence = field(default_factory=Evidence)
+    rows_b: Evidence = field(default_factory=Evidence)
+    keys: tuple[str, ...] = ()
+    time: str | None = None
 
     @property
     def same(self) -> bool:
@@ -83,75 +99,6 @@ class TableDiff:
                 time = math.inf if rows.first_time_s is None else rows.first_time_s
                 found.append((time, f"{rows.first_who}: {words}".removeprefix(": "), None))
         return min(found, key=lambda item: item[0], default=None)
-
-
-class _Feed:
-    """A stream of rows in ascending time, taken in pieces up to a time."""
-
-    def __init__(self, log: Log) -> None:
-        self.log, self.batches = log, log.batches()
-        self.table: pa.Table | None = None
-        self.time: Ints = np.zeros(0, np.int64)  # us
-        self.ended = False
-
-    def more(self) -> None:
-        """One batch more."""
-        batch = next(self.batches, None)
-        if batch is None:
-            self.ended = True
-            return
-        if not batch.num_rows:
-            return
-        time = self._times(batch)
-        last = self.time[-1:] if len(self.time) else time[:1]
-        if np.any(np.diff(np.concatenate([last, time])) < 0):
-            raise InputError(f"{self.log.path}: time does not ascend near {time[0] / 1e6:g} s")
-        rest = None if self.table is None or not self.table.num_rows else self.table
-        try:
-            self.table = batch if rest is None else pa.concat_tables([rest, batch], promote_options="permissive")
-        except pa.ArrowException as error:
-            raise InputError(f"{self.log.path}: its parts do not fit together: {str(error).partition(chr(10))[0]:.200}") from None
-        self.time = np.concatenate([self.time, time])
-        if self.time[0] == self.time[-1] and self.table.nbytes > INSTANT_BYTES:
-            what = "one instant" if self.log.time else "a log without times"
-            raise InputError(f"{self.log.path}: more than {INSTANT_BYTES >> 20} MiB of rows of {what}")
-
-    def _times(self, batch: pa.Table) -> Ints:
-        if self.log.time is None:
-            return np.zeros(batch.num_rows, np.int64)
-        if self.log.time not in batch.column_names:
-            raise InputError(f"{self.log.path}: has rows without {self.log.time}")
-        time = _floats(batch[self.log.time])
-        if time is None or not np.all(np.abs(time) < 1e12):
-            raise InputError(f"{self.log.path}: a time is missing or not a finite number")
-        return np.round(time * 1e6).astype(np.int64)
-
-    def take(self, limit: int | None) -> tuple[pa.Table, Ints]:
-        """Remove and return the rows before a time; None: all."""
-        count = len(self.time) if limit is None else int(np.searchsorted(self.time, limit))
-        table = self.table if self.table is not None else pa.table({})
-        part, times = table.slice(0, count), self.time[:count]
-        self.table, self.time = table.slice(count), self.time[count:]
-        return part, times
-
-
-def _windows(a: _Feed, b: _Feed) -> Iterator[tuple[pa.Table, Ints, pa.Table, Ints]]:
-    """Pieces of both streams that hold the same instants, each instant whole."""
-    while True:
-        for feed in (a, b):
-            while not feed.ended and not len(feed.time):
-                feed.more()
-        if a.ended and b.ended and not len(a.time) and not len(b.time):
-            return
-        open_ends = [int(feed.time[-1]) for feed in (a, b) if not feed.ended]
-        limit = min(open_ends) if open_ends else None
-        if limit is not None and all(not len(f.time) or f.time[0] >= limit for f in (a, b)):
-            for feed in (a, b):
-                if not feed.ended and feed.time[-1] == limit:
-                    feed.more()
-            continue
-        (table_a, time_a), (table_b, time_b) = a.take(limit), b.take(limit)
-        yield table_a, time_a, table_b, time_b
 
 
 def compare(a: Log, b: Log, tolerances: Tolerances, renamed: dict[str, str], thinned: bool = False) -> TableDiff:
@@ -174,19 +121,32 @@ def compare(a: Log, b: Log, tolerances: Tolerances, renamed: dict[str, str], thi
 class _Comparison:
     def __init__(self, a: Log, b: Log, tolerances: Tolerances, renamed: dict[str, str], thinned: bool) -> None:
         self.a, self.b, self.tolerances, self.renamed, self.thinned = a, b, tolerances, renamed, thinned
-        self.out = TableDiff(a.name or b.name)
         self.keys = a.keys or b.keys
+        self.out = TableDiff(a.name or b.name, keys=self.keys, time=a.time or b.time)
         self.timed = (a.time or b.time) is not None
         self.codes: dict[str, int] = {}
+        self.pairs: dict[tuple[int, int], int] = {}
         self.seen_a: set[str] = set()
         self.seen_b: set[str] = set()
         self.filled: tuple[set[str], set[str]] = (set(), set())
+        self.differ = np.zeros(0, np.bool_)  # trains, by code
+        self.spans = Spans.of(a, tolerances)
+        self.in_time: InTime | None = None
+        if self.timed and tolerances.in_time(self.out.table):
+            self.in_time = InTime(self.out.table, {*self.keys, a.time, b.time}, tolerances, self.spans, thinned)
 
     def run(self) -> TableDiff:
-        for table_a, time_a, table_b, time_b in _windows(_Feed(self.a), _Feed(self.b)):
-            for filled, table in zip(self.filled, (table_a, table_b), strict=True):
-                filled |= {n for n in table.column_names if n not in filled and _filled(table[n])}
+        feeds = Feed(self.a), Feed(self.b)
+        for table_a, time_a, table_b, time_b in windows(*feeds):
+            for known, table in zip(self.filled, (table_a, table_b), strict=True):
+                known |= {n for n in table.column_names if n not in known and filled(table[n])}
+            if self.tolerances.common:
+                table_a, time_a = _shared(table_a, time_a, feeds[1])
+                table_b, time_b = _shared(table_b, time_b, feeds[0])
             self.window(table_a, time_a, table_b, time_b)
+        if self.in_time is not None:
+            self.judge(self.in_time.rest())
+        self.out.trains = list(self.codes)
         skipped = {self.a.time, self.b.time, *self.keys}
         in_a, in_b = ({n for n in filled if n not in skipped} for filled in self.filled)
         if self.out.rows:  # without rows nothing is known about columns
@@ -217,19 +177,27 @@ class _Comparison:
             if int(out.max(initial=0)) >= (1 << 62) // (len(self.codes) + 1):
                 out = np.unique(out, return_inverse=True)[1].astype(np.int64)
             out = out * (len(self.codes) + 1) + column
-        repeats = np.concatenate([_repeats(out[:split]), _repeats(out[split:])])
-        if repeats.any():
-            out = np.unique(out, return_inverse=True)[1] * (int(repeats.max()) + 1) + repeats
+        again = np.concatenate([repeats(out[:split]), repeats(out[split:])])
+        if again.any():
+            out = np.unique(out, return_inverse=True)[1] * (int(again.max()) + 1) + again
         return out[:split], out[split:]
+
+    def curves(self, columns: list[Ints]) -> Ints:
+        """One number per row for all its names."""
+        out = columns[0]
+        for level, column in enumerate(columns[1:]):
+            packed, back = np.unique((out << 32) | column, return_inverse=True)
+            out = np.array([self.pairs.setdefault((level, int(p)), len(self.pairs)) for p in packed], np.int64)[back]
+        return out
 
     def window(self, ta: pa.Table, time_a: Ints, tb: pa.Table, time_b: Ints) -> None:
         """Match and compare the rows of some instants."""
-        if self.thinned:
+        if self.thinned and self.in_time is None:
             wanted = np.isin(time_b, time_a)
             tb, time_b = tb.filter(pa.array(wanted)), time_b[wanted]
-        times = np.concatenate([time_a, time_b])
+        times, split = np.concatenate([time_a, time_b]), len(time_a)
         for _ in range(2):
-            columns = []
+            columns = [np.full(len(times), self.code(""), np.int64)] if not self.keys else []
             for k, key in enumerate(self.keys):
                 codes_a, texts_a = self.names(ta, key, False)
                 codes_b, texts_b = self.names(tb, key, True)
@@ -237,7 +205,7 @@ class _Comparison:
                 if k == 0:
                     self.seen_a.update(texts_a)
                     self.seen_b.update(texts_b)
-            packed_a, packed_b = self.matched(times, columns, len(time_a))
+            packed_a, packed_b = self.matched(times, columns, split)
             if len(packed_a) == len(packed_b) and np.array_equal(packed_a, packed_b):
                 rows_a = rows_b = np.arange(len(packed_a))
                 only_a = only_b = np.zeros(0, np.int64)
@@ -245,20 +213,34 @@ class _Comparison:
             _, rows_a, rows_b = np.intersect1d(packed_a, packed_b, return_indices=True)
             only_a = np.setdiff1d(np.arange(len(packed_a)), rows_a)
             only_b = np.setdiff1d(np.arange(len(packed_b)), rows_b)
-            if not self.found_renamed(ta, time_a, only_a, tb, time_b, only_b):
+            if self.in_time is not None or not self.found_renamed(ta, time_a, only_a, tb, time_b, only_b):
                 break
-        self.unmatched(self.out.missing, ta, time_a, only_a)
-        self.unmatched(self.out.extra, tb, time_b, only_b)
-        if not len(rows_a):
-            return
-        self.out.rows += len(rows_a)
-        order = np.argsort(rows_a, kind="stable")
-        rows_a, rows_b = rows_a[order], rows_b[order]
-        if not np.array_equal(rows_a, np.arange(ta.num_rows)):
-            ta, time_a = ta.take(pa.array(rows_a)), time_a[rows_a]
-        if not np.array_equal(rows_b, np.arange(tb.num_rows)):
-            tb = tb.take(pa.array(rows_b))
-        self.values(ta, time_a, tb)
+        train_a, train_b = columns[0][:split], columns[0][split:]
+        self.out.all_a.add(train_a, time_a / 1e6)
+        self.out.all_b.add(train_b, time_b / 1e6)
+        if self.in_time is not None:
+            curves = self.curves(columns)
+            piece_a, piece_b = Piece(ta, time_a, train_a, curves[:split]), Piece(tb, time_b, train_b, curves[split:])
+            self.judge(self.in_time.add(piece_a, piece_b, int(times.max(initial=0))))
+        else:
+            if len(only_a) or len(only_b):
+                curves = self.curves(columns)
+                self.unmatched(self.out.missing, self.out.only_a, Piece(ta, time_a, train_a, curves[:split]), only_a)
+                self.unmatched(self.out.extra, self.out.only_b, Piece(tb, time_b, train_b, curves[split:]), only_b)
+            if len(rows_a):
+                order = np.argsort(rows_a, kind="stable")
+                self.values(ta, time_a, train_a, tb, rows_a[order], rows_b[order])
+        for evidence, table, time, train in ((self.out.rows_a, ta, time_a, train_a), (self.out.rows_b, tb, time_b, train_b)):
+            if self.differ.any():
+                self.marked(train[:0], len(self.codes))
+                evidence.add(table, time / 1e6, train, self.differ[train])
+
+    def marked(self, train: Ints, size: int = 0) -> None:
+        """Note trains that differ: their rows are kept from here on."""
+        more = max(int(train.max(initial=-1)) + 1, size) - len(self.differ)
+        if more > 0:
+            self.differ = np.concatenate([self.differ, np.zeros(max(more, len(self.differ)), np.bool_)])
+        self.differ[train] = True
 
     def found_renamed(self, ta: pa.Table, time_a: Ints, only_a: Ints, tb: pa.Table, time_b: Ints, only_b: Ints) -> bool:
         """Names of B that stand for others of A: new in B, with a row that is otherwise that of a train missing in B."""
@@ -298,19 +280,21 @@ class _Comparison:
             tolerance = self.tolerances.of(self.out.table, column)
             if tolerance.ignore:
                 continue
-            bad, difference = _differing(column, a[column], b[column], tolerance)
-            numbers += difference is not None
-            if bad.any() and str(a[column][0].as_py()).replace(name_a, name_b) != str(b[column][0].as_py()):
+            found = differing(column, a[column], b[column], tolerance, self.spans.of_column(column))
+            numbers += found.difference is not None
+            if found.bad.any() and str(a[column][0].as_py()).replace(name_a, name_b) != str(b[column][0].as_py()):
                 return False
         return numbers > 0
 
-    def unmatched(self, rows: Rows, table: pa.Table, times: Ints, which: Ints) -> None:
+    def unmatched(self, rows: Rows, presence: Presence, piece: Piece, which: Ints) -> None:
         if not len(which):
             return
         if not rows.count:
             row = int(which[0])
-            rows.first_time_s, rows.first_who = self.at(times, row), self.who(table, row)
+            rows.first_time_s, rows.first_who = self.at(piece.time, row), self.who(piece.table, row)
         rows.count += len(which)
+        self.marked(piece.train[which])
+        presence.add(piece.train[which], piece.time[which] / 1e6, piece.again()[which] > 0)
 
     def at(self, times: Ints, row: int) -> float | None:
         return float(times[row] / 1e6) if self.timed else None
@@ -320,33 +304,86 @@ class _Comparison:
         names = {key: table[key][row].as_py() for key in self.keys if key in table.column_names}
         return ", ".join(f"{key} {value}" for key, value in names.items() if value is not None)
 
-    def values(self, ta: pa.Table, times: Ints, tb: pa.Table) -> None:
+    def values(self, ta: pa.Table, times: Ints, train: Ints, tb: pa.Table, rows_a: Ints, rows_b: Ints) -> None:
         """Compare matched rows column by column."""
+        self.out.rows += len(rows_a)
+        if not np.array_equal(rows_a, np.arange(ta.num_rows)):
+            ta, times, train = ta.take(pa.array(rows_a)), times[rows_a], train[rows_a]
+        if not np.array_equal(rows_b, np.arange(tb.num_rows)):
+            tb = tb.take(pa.array(rows_b))
+        for column, tolerance in self.wanted(ta, tb):
+            found = differing(column, ta[column], tb[column], tolerance, self.spans.of_column(column))
+            if self.renamed and found.bad.any():
+                found = found._replace(bad=self.but_names(found.bad, ta[column], tb[column]))
+            self.enter(column, tolerance, found, times, train, ta, ta[column], tb[column])
+
+    def wanted(self, ta: pa.Table, tb: pa.Table) -> Iterator[tuple[str, Tolerance]]:
+        """Columns that are compared, and how."""
         skipped = {*self.keys, self.a.time, self.b.time}
         for column in [name for name in ta.column_names if name in tb.column_names and name not in skipped]:
             tolerance = self.tolerances.of(self.out.table, column)
             if column not in CLOCKS.get(self.out.table, ()):
                 self.out.compared.add(column)
-            if tolerance.ignore:
-                continue
-            bad, difference = _differing(column, ta[column], tb[column], tolerance)
-            if self.renamed and bad.any():
-                bad = self.but_names(bad, ta[column], tb[column])
-            if not bad.any():
-                continue
-            entry = self.out.columns.setdefault(column, ColumnDiff(column, tolerance))
-            entry.differing += int(np.count_nonzero(bad))
+            if not tolerance.ignore:
+                yield column, tolerance
 
-            def place(row: int, column: str = column, difference: Floats | None = difference) -> Place:
-                a, b = ta[column][row].as_py(), tb[column][row].as_py()
-                gap = None if difference is None else float(difference[row])
-                return Place(self.at(times, row), self.who(ta, row), _number(a, gap), _number(b, gap), gap)
+    def enter(
+        self, column: str, tolerance: Tolerance, found: Compared, times: Ints, train: Ints, rows: pa.Table,
+        a: pa.ChunkedArray | None, b: pa.ChunkedArray, cut: tuple[Floats, Floats] | None = None,
+    ) -> None:  # fmt: skip
+        """Remember what differs in one column of some rows; ``a`` is None if the reference has no rows of its own there."""
+        bad, difference = found.bad, found.difference
+        tally = self.out.tallies.get(column)
+        if not bad.any():
+            if tally is not None:
+                tally.add(train, times / 1e6, found)
+            return
+        tally = self.out.tallies.setdefault(column, Tally())
+        tally.add(train, times / 1e6, found, cut)
+        self.marked(np.unique(train[bad]))
+        entry = self.out.columns.setdefault(column, ColumnDiff(column, tolerance))
+        entry.differing += int(np.count_nonzero(bad))
 
-            entry.first = entry.first or place(int(np.argmax(bad)))
-            if difference is not None:
-                worst = int(np.argmax(np.where(bad, difference, -1.0)))
-                if entry.largest is None or not entry.largest.difference or difference[worst] > entry.largest.difference:
-                    entry.largest = place(worst)
+        def place(row: int) -> Place:
+            gap = None if difference is None else float(difference[row])
+            if a is not None:
+                left = _number(a[row].as_py(), gap)
+            else:
+                left = None if found.a is None else float(found.a[row])
+            right = _number(b[row].as_py(), gap) if a is not None or found.b is None else float(found.b[row])
+            lower, upper = (None, None) if cut is None else (float(cut[0][row]), float(cut[1][row]))
+            return Place(self.at(times, row), self.who(rows, row), left, right, gap, lower, upper)
+
+        first = int(np.argmax(bad))
+        if entry.first is None or (entry.first.time_s is not None and entry.first.time_s > times[first] / 1e6):
+            entry.first = place(first)
+        if difference is None:
+            for who, row in zip(*np.unique(train[bad], return_index=True), strict=True):
+                if int(who) not in tally.texts and len(tally.texts) < NAMED_TEXTS:
+                    at = int(np.flatnonzero(bad)[row])
+                    tally.texts[int(who)] = (None if a is None else a[at].as_py(), b[at].as_py())
+        if difference is not None:
+            worst = int(np.argmax(np.where(bad, difference, -1.0)))
+            if entry.largest is None or not entry.largest.difference or difference[worst] > entry.largest.difference:
+                entry.largest = place(worst)
+
+    def judge(self, judged: Judged) -> None:
+        """Enter what was judged by tubes."""
+        sides = ((self.out.missing, self.out.only_a, judged.missing), (self.out.extra, self.out.only_b, judged.extra))
+        for rows, presence, parts in sides:
+            for part, doubled in parts:
+                if not rows.count:
+                    rows.first_time_s, rows.first_who = self.at(part.time, 0), self.who(part.table, 0)
+                rows.count += len(part.time)
+                self.marked(part.train)
+                presence.add(part.train, part.time / 1e6, doubled)
+        self.out.rows += judged.rows
+        for v in judged.values:
+            if v.column not in CLOCKS.get(self.out.table, ()):
+                self.out.compared.add(v.column)
+            piece = v.piece
+            b = v.piece.table[v.column] if v.b is None else v.b
+            self.enter(v.column, v.tolerance, v.found, piece.time, piece.train, piece.table, v.a, b, v.cut)
 
     def but_names(self, bad: Bools, a: pa.ChunkedArray, b: pa.ChunkedArray) -> Bools:
         """Texts that differ in the name of a renamed train alone do not differ."""
@@ -361,102 +398,16 @@ class _Comparison:
         return out
 
 
-def _repeats(keys: Ints) -> Ints:
-    """How many rows with the same key stand before each row."""
-    order = np.argsort(keys, kind="stable")
-    same = np.zeros(len(keys), np.bool_)
-    same[1:] = keys[order][1:] == keys[order][:-1]
-    out = np.zeros(len(keys), np.int64)
-    if same.any():
-        start = np.where(same, 0, np.arange(len(keys)))
-        out[order] = np.arange(len(keys)) - np.maximum.accumulate(start)
-    return out
+def _shared(table: pa.Table, time: Ints, other: Feed) -> tuple[pa.Table, Ints]:
+    """Rows within the time that the other log covers."""
+    if other.first is None or other.last is None:
+        return table.slice(0, 0), time[:0]
+    begin = int(np.searchsorted(time, other.first))
+    end = int(np.searchsorted(time, other.last, side="right")) if other.ended else len(time)
+    return table.slice(begin, max(0, end - begin)), time[begin : max(begin, end)]
 
 
 def _number(value: Any, difference: float | None) -> Any:
     if difference is None or value is None:
         return value
     return None if value == "" else float(value)
-
-
-def _floats(column: pa.ChunkedArray) -> Floats | None:
-    """A column as numbers, NaN where nothing stands; None if it holds other texts."""
-    if pa.types.is_null(column.type):
-        return np.full(len(column), np.nan)
-    try:
-        numbers = column.cast(pa.float64(), safe=False)
-    except pa.ArrowException:
-        if not pa.types.is_string(column.type) or not pc.any(pc.equal(column, "")).as_py():
-            return None
-        return _floats(pa.chunked_array([pa.array([text or None for text in column.to_pylist()], pa.string())]))
-    out: Floats = numbers.to_numpy().astype(np.float64, copy=False)
-    return out
-
-
-def _filled(column: pa.ChunkedArray) -> bool:
-    """Whether anything stands in a column; SUMO writes an empty text where it has nothing to say."""
-    if pa.types.is_string(column.type):
-        return bool(pc.any(pc.not_equal(column, "")).as_py())
-    return bool(column.null_count < len(column))
-
-
-def _resolution(column: pa.ChunkedArray) -> float:
-    """What the last decimal of a column of texts stands for; 0 if it is unknown."""
-    if not pa.types.is_string(column.type):
-        return 0.0
-    for text in column.slice(0, 64).to_pylist():
-        _, dot, decimals = (text or "").partition(".")
-        if dot and decimals.isdigit():
-            return float(10.0 ** -len(decimals))
-    return 0.0
-
-
-def _differing(name: str, a: pa.ChunkedArray, b: pa.ChunkedArray, tolerance: Tolerance) -> tuple[Bools, Floats | None]:
-    """Rows that differ by more than the tolerance, and by how much (None for texts)."""
-    numbers_a = numbers_b = None
-    if name not in NAMES:
-        numbers_a, numbers_b = _floats(a), _floats(b)
-    if numbers_a is None or numbers_b is None:
-        texts_a, texts_b = (pc.fill_null(column.cast(pa.string()), "") for column in (a, b))
-        equal: Bools = pc.equal(texts_a, texts_b).to_numpy()
-        bad = ~equal
-        if name not in NAMES:
-            for row in np.flatnonzero(bad):
-                bad[row] = not alike(texts_a[int(row)].as_py(), texts_b[int(row)].as_py(), tolerance)
-        return bad, None
-    absolute, relative = tolerance.absolute, tolerance.relative
-    if not tolerance.stated:
-        absolute = max(absolute, 1.01 * _resolution(a), 1.01 * _resolution(b))
-        if any(pa.types.is_float32(column.type) for column in (a, b)):
-            relative = max(relative, 2.5e-7)
-    with np.errstate(invalid="ignore", over="ignore"):
-        difference = np.abs(numbers_a - numbers_b)
-        allowed = np.maximum(absolute, relative * np.maximum(np.abs(numbers_a), np.abs(numbers_b)))
-        same = (numbers_a == numbers_b) | (np.isnan(numbers_a) & np.isnan(numbers_b))
-        close = np.isfinite(difference) & (difference <= allowed)
-    difference = np.where(same, 0.0, np.where(np.isfinite(difference), difference, np.inf))
-    return ~(same | close), difference
-
-
-def alike(a: str, b: str, tolerance: Tolerance) -> bool:
-    """Whether two texts differ by no more than the numbers in them, each within the tolerance."""
-    if len(a) > 1 << 20 or len(b) > 1 << 20:
-        return False
-    words_a, words_b = a.replace(",", " ").split(), b.replace(",", " ").split()
-    if len(words_a) != len(words_b):
-        return False
-    return all(x == y or _close(x, y, tolerance) for x, y in zip(words_a, words_b, strict=True))
-
-
-def _close(a: str, b: str, tolerance: Tolerance) -> bool:
-    try:
-        x, y = float(a.strip("[]()\"'{}")), float(b.strip("[]()\"'{}"))
-    except ValueError:
-        return False
-    if not (math.isfinite(x) and math.isfinite(y)) or "_" in a or "_" in b:
-        return False
-    absolute = tolerance.absolute
-    if not tolerance.stated:
-        decimals = min((len(text.partition(".")[2]) for text in (a, b) if "." in text), default=0)
-        absolute = max(absolute, 1.01 * 10.0**-decimals if decimals else 0.0)
-    return abs(x - y) <= max(absolute, tolerance.relative * max(abs(x), abs(y)))

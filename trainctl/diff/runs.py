@@ -11,9 +11,13 @@ import dataclasses
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from trainctl.diff.causes import causes
+from trainctl.diff.findings import Finding, merged
+from trainctl.diff.golden import golden_of_logs, thinned
 from trainctl.diff.rows import Place, TableDiff, compare
 from trainctl.diff.sources import KINDS, our_events, our_table, sumo_log, sumo_logs_in
 from trainctl.diff.tolerance import EXACT, Tolerance, Tolerances, parse_tolerances, read_tolerances
@@ -22,9 +26,6 @@ from trainctl.record.folder import INFO, plain
 from trainctl.runs.run import Run
 
 __all__ = ["EXACT", "Report", "Tolerance", "Tolerances", "diff", "parse_tolerances", "read_tolerances"]
-
-#: Entry of run.json: the logs of a golden run that hold only some instants.
-THINNED = "thinned"
 
 
 @dataclass
@@ -39,11 +40,20 @@ class Report:
     renamed: dict[str, str] = field(default_factory=dict)  # name in A -> name in B
     files: list[str] = field(default_factory=list)  # logs that only one has
     notes: list[str] = field(default_factory=list)  # what is not a difference
+    tolerances: Tolerances = field(default_factory=Tolerances)
 
     @property
     def same(self) -> bool:
         """Whether nothing differs beyond the tolerances."""
         return not (self.settings or self.renamed or self.files) and all(t.same for t in self.tables)
+
+    @cached_property
+    def findings(self) -> list[Finding]:
+        """The differences by train and cause, in the order of time."""
+        out = [Finding("setting", f"{key}: {x} -> {y}") for key, x, y in self.settings]
+        out += [Finding("file", f"log {text}", tables=[text.partition(":")[0]]) for text in self.files]
+        out += [Finding("renamed", f"train {old} is called {new}", [old, new]) for old, new in self.renamed.items()]
+        return merged([*out, *(f for t in self.tables for f in causes(t, self.tolerances))])
 
     @property
     def first(self) -> str | None:
@@ -60,25 +70,23 @@ class Report:
         """Everything in what JSON knows."""
         return {
             "same": self.same, "a": self.a, "b": self.b, "first": self.first, "renamed": self.renamed, "files": self.files,
-            "settings": [{"key": key, "a": x, "b": y} for key, x, y in self.settings], "notes": self.notes,
-            "tables": [_table(t) for t in self.tables],
+            "settings": [{"key": key, "a": _json(x), "b": _json(y)} for key, x, y in self.settings], "notes": self.notes,
+            "findings": [plain(f.as_dict()) for f in self.findings], "tables": [_table(t) for t in self.tables],
         }  # fmt: skip
 
     def lines(self, most: int = 20) -> list[str]:
-        """The differences, one line each, worst tables first as they stand."""
+        """The differences, one line each: the first, the findings, then table by table."""
         out = [f"first: {self.first}"] if self.first else []
-        out += [f"renamed: {old} -> {new}" for old, new in self.renamed.items()]
-        out += [f"{key}: {x} -> {y}" for key, x, y in self.settings] + self.files
+        out += [f"{f.words} [{f.where}]" if f.where else f.words for f in self.findings[:most]]
         for t in self.tables:
             out += [f"{t.table}: {rows.count} rows only in {side}, first {at(rows.first_time_s, rows.first_who)}"
                     for rows, side in ((t.missing, "A"), (t.extra, "B")) if rows.count]  # fmt: skip
-            out += [f"{t.table}.{name}: only in A" for name in t.lost_columns]
             for c in t.columns.values():
                 worst = c.largest or c.first
                 assert worst is not None
                 where = at(worst.time_s, worst.who)
                 out.append(f"{t.table}.{c.column}: {c.differing} of {t.rows} rows differ, most at {where}: {told(worst)}")
-        return out if len(out) <= most else [*out[:most], f"... and {len(out) - most} lines more"]
+        return out if len(out) <= 2 * most else [*out[: 2 * most], f"... and {len(out) - 2 * most} lines more"]
 
 
 def at(time_s: float | None, who: str) -> str:
@@ -88,9 +96,11 @@ def at(time_s: float | None, who: str) -> str:
 
 def told(place: Place) -> str:
     """A difference in words."""
+    text = f"{_short(place.a)} -> {_short(place.b)}"
     if place.difference is None:
-        return f"{_short(place.a)} -> {_short(place.b)}"
-    return f"{_short(place.a)} -> {_short(place.b)} (by {place.difference:.3g})"
+        return text
+    tube = f"; tube {_short(place.lower)} .. {_short(place.upper)}" if place.lower is not None else ""
+    return f"{text} (by {place.difference:.3g}{tube})"
 
 
 def _short(value: float | str | None) -> str:
@@ -100,9 +110,19 @@ def _short(value: float | str | None) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
+def _json(value: Any) -> Any:
+    """A value of a scenario in what JSON knows: dates, which TOML has, as text."""
+    if isinstance(value, list):
+        return [_json(item) for item in value]
+    if isinstance(value, Mapping):
+        return {str(key): _json(item) for key, item in value.items()}
+    return plain(value) if value is None or isinstance(value, str | bool | int | float) else str(value)
+
+
 def _table(t: TableDiff) -> dict[str, Any]:
     columns = [{
-        "column": c.column, "absolute": c.tolerance.absolute, "relative": c.tolerance.relative, "differing": c.differing,
+        "column": c.column, "absolute": c.tolerance.absolute, "relative": c.tolerance.relative, "tolerance": c.tolerance.told(),
+        "differing": c.differing,
         "first": None if c.first is None else dataclasses.asdict(c.first),
         "largest": None if c.largest is None else dataclasses.asdict(c.largest),
     } for c in t.columns.values()]  # fmt: skip
@@ -114,14 +134,14 @@ def _table(t: TableDiff) -> dict[str, Any]:
 
 
 def diff(a: Path | str, b: Path | str, tolerances: Tolerances | None = None) -> Report:
-    """Compare two run folders, two folders of SUMO's logs, or two of SUMO's logs, in whatever format each is.
+    """Compare two run folders, two folders of SUMO's logs, or two of SUMO's logs, in whatever format each is; or with a golden.
 
     Parameters
     ----------
     a, b : Path
         The reference, and what is compared with it.
     tolerances : Tolerances, optional
-        Default: 1e-6 absolute, 1e-9 relative, wider for forces and energies, and never finer than the decimals of a log.
+        Default: 1e-6 absolute, 2e-9 relative, wider for forces and energies, and never finer than the decimals of a log.
 
     Raises
     ------
@@ -132,11 +152,13 @@ def diff(a: Path | str, b: Path | str, tolerances: Tolerances | None = None) -> 
     for path in (a, b):
         if not path.exists():
             raise InputError(f"{path}: no such file or directory")
-    report = Report(str(a), str(b))
+    report = Report(str(a), str(b), tolerances=chosen)
     names: dict[str, str] = {}  # in B -> in A
-    if a.is_dir() != b.is_dir():
+    if golden_of_logs(a):
+        _of_golden(report, a, b, chosen, names)
+    elif a.is_dir() != b.is_dir():
         raise InputError(f"{a}, {b}: one is a folder, the other a file: give two run folders or two logs")
-    if not a.is_dir():
+    elif not a.is_dir():
         _logs(report, a, b, chosen, names)
     elif (a / INFO).exists() and (b / INFO).exists():
         _runs(report, Run(a), Run(b), chosen, names)
@@ -152,7 +174,7 @@ def diff(a: Path | str, b: Path | str, tolerances: Tolerances | None = None) -> 
 
 
 def _logs(
-    report: Report, a: Path, b: Path, tolerances: Tolerances, names: dict[str, str], thinned: bool = False, name: str = ""
+    report: Report, a: Path, b: Path, tolerances: Tolerances, names: dict[str, str], part: bool = False, name: str = ""
 ) -> None:
     """Compare two logs of SUMO's."""
     logs = []
@@ -171,7 +193,7 @@ def _logs(
     kind = next((k for k in KINDS if k.name == (one.name or two.name or name)), None)
     if kind is not None:  # an empty log is one of any kind
         one, two = (dataclasses.replace(log, name=kind.name, time=kind.time, keys=kind.keys) for log in (one, two))
-    report.tables.append(compare(one, two, tolerances, names, thinned))
+    report.tables.append(compare(one, two, tolerances, names, part))
 
 
 def _note(report: Report, text: str) -> None:
@@ -179,23 +201,32 @@ def _note(report: Report, text: str) -> None:
         report.notes.append(text)
 
 
-def _folders(
-    report: Report, a: Path, b: Path, tolerances: Tolerances, names: dict[str, str], thinned: Collection[str] = ()
-) -> None:
+def _folders(report: Report, a: Path, b: Path, tolerances: Tolerances, names: dict[str, str], some: Collection[str] = ()) -> None:
     """Compare all logs of SUMO's in two folders."""
     in_a, in_b = sumo_logs_in(a), sumo_logs_in(b)
     for kind in (k.name for k in KINDS):
         if kind in in_a and kind in in_b:
-            _logs(report, in_a[kind], in_b[kind], tolerances, names, kind in thinned, kind)
+            _logs(report, in_a[kind], in_b[kind], tolerances, names, kind in some, kind)
         elif kind in in_a:
             report.files.append(f"{kind}: only in A")
-        elif kind in in_b and not thinned:
+        elif kind in in_b and not some:
             report.files.append(f"{kind}: only in B")
+
+
+def _of_golden(report: Report, a: Path, b: Path, tolerances: Tolerances, names: dict[str, str]) -> None:
+    """Compare logs with their golden."""
+    if b.is_dir():
+        _folders(report, a, b, tolerances, names, thinned(a))
+        return
+    log, kept = sumo_log(b), sumo_logs_in(a)
+    if log is None or log.name not in kept:
+        raise InputError(f"{b}: the golden {a} has {', '.join(kept) or 'no log'}, not {log.name if log else 'this'}")
+    _logs(report, kept[log.name], b, tolerances, names, log.name in thinned(a))
 
 
 def _runs(report: Report, a: Run, b: Run, tolerances: Tolerances, names: dict[str, str]) -> None:
     """Compare two run folders."""
-    thinned = _thinned(a)
+    kept = thinned(a.folder)
     for package in sorted({*_versions(a), *_versions(b)}):
         x, y = _versions(a).get(package), _versions(b).get(package)
         if x != y:
@@ -206,19 +237,14 @@ def _runs(report: Report, a: Run, b: Run, tolerances: Tolerances, names: dict[st
     _scenarios(report, a.scenario, b.scenario)
     for table in ("trains", "units", "links"):
         if a.files(table) and b.files(table):
-            report.tables.append(compare(our_table(a, table), our_table(b, table), tolerances, names, table in thinned))
-        elif a.files(table) or (b.files(table) and not thinned):
+            report.tables.append(compare(our_table(a, table), our_table(b, table), tolerances, names, table in kept))
+        elif a.files(table) or (b.files(table) and not kept):
             report.files.append(f"{table}: only in {'A' if a.files(table) else 'B'}")
     report.tables.append(compare(our_events(a, {}), our_events(b, dict(names)), tolerances, {}))
     if a.info.get("backend") == b.info.get("backend"):
-        _folders(report, a.folder / "sumo", b.folder / "sumo", tolerances, names, thinned)
+        _folders(report, a.folder / "sumo", b.folder / "sumo", tolerances, names, kept)
     else:
         _note(report, f"backend {a.info.get('backend')} -> {b.info.get('backend')}: SUMO's logs are not compared")
-
-
-def _thinned(run: Run) -> Collection[str]:
-    named = run.info.get(THINNED)
-    return [str(name) for name in named] if isinstance(named, list) else []
 
 
 def _versions(run: Run) -> Mapping[str, Any]:

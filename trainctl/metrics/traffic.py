@@ -7,11 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
 
 from trainctl.errors import InputError
 from trainctl.metrics.values import Values, put_worst
+from trainctl.runs.logs import seconds, vehicles
 from trainctl.runs.series import INSTANT, Series
-from trainctl.runs.sumo_logs import elements, fcd_batches, find_log
+from trainctl.runs.sumo_logs import elements, find_log
 from trainctl.signals import Floats
 
 #: Headways in time are counted for trains faster than this [m/s]: one that stands has none.
@@ -134,7 +137,7 @@ def of_sumo(folder: Path) -> Values:
 
 def _number(path: Path, attributes: dict[str, str], name: str) -> float:
     try:
-        return float(attributes.get(name, "0"))
+        return float(seconds(attributes.get(name, "0")))
     except ValueError:
         raise InputError(f"{path}: {name} = {attributes[name]:.40}: not a number") from None
 
@@ -152,37 +155,32 @@ def metrics_of_fcd(path: Path | str) -> Values:
     InputError
         Not an FCD log, damaged, or with document types or entities in it.
     """
-    return _of_rows(fcd_batches(Path(path)), Path(path))
+    return _of_rows(vehicles(Path(path)), Path(path))
 
 
-def _of_rows(batches: Iterable[pd.DataFrame], path: Path) -> Values:
-    vehicles: set[str] = set()
+def _of_rows(batches: Iterable[pa.Table], path: Path) -> Values:
+    names: set[str] = set()
     steps = rows = standing = 0
     begin, end = np.inf, -np.inf
     speed_sum, speed_max = 0.0, -np.inf
     spacing, headway = _Mean(), _Mean()
     for batch in batches:
-        time, speed = batch["time_s"].to_numpy(), batch["speed"].to_numpy()
+        time, speed = batch["time"].to_numpy(), batch["speed"].to_numpy()
         if np.any(np.diff(time) < 0) or time[0] <= end:
             raise InputError(f"{path}: time does not ascend near {time[0]:g} s")
         begin, end = min(begin, float(time[0])), float(time[-1])
-        vehicles.update(batch["id"].unique())
+        names.update(batch["id"].unique().to_pylist())
         steps += 1 + int(np.count_nonzero(np.diff(time) > INSTANT))
         rows, standing = rows + len(time), standing + int(np.count_nonzero(speed < 0.1))
         speed_sum, speed_max = speed_sum + float(speed.sum()), max(speed_max, float(speed.max()))
-        if {"lane", "pos"} <= set(batch.columns):
-            order = np.lexsort((batch["pos"].to_numpy(), batch["lane"].astype("category").cat.codes.to_numpy(), time))
-            one = batch.iloc[order]
-            same = (one["time_s"].to_numpy()[1:] == one["time_s"].to_numpy()[:-1]) & (
-                one["lane"].to_numpy()[1:] == one["lane"].to_numpy()[:-1]
-            )
-            distance, follower = np.diff(one["pos"].to_numpy())[same], one["speed"].to_numpy()[:-1][same]
+        if {"lane", "pos"} <= set(batch.column_names):
+            distance, follower = _spacings(batch)
             spacing.add(distance)
             headway.add(distance[follower > MOVING_MPS] / follower[follower > MOVING_MPS])
     if not rows:
         raise InputError(f"{path}: no vehicle in this FCD log")
     values: Values = {
-        "fcd.duration_s": end - begin, "fcd.steps": steps, "fcd.vehicles": len(vehicles), "fcd.rows": rows,
+        "fcd.duration_s": end - begin, "fcd.steps": steps, "fcd.vehicles": len(names), "fcd.rows": rows,
         "fcd.vehicles_mean": rows / steps, "fcd.speed_mean_mps": speed_sum / rows, "fcd.speed_max_mps": speed_max,
         "fcd.standing_share": standing / rows,
     }  # fmt: skip
@@ -190,6 +188,17 @@ def _of_rows(batches: Iterable[pd.DataFrame], path: Path) -> Values:
         if mean.count:
             values |= {f"fcd.{name}_min_{unit}": mean.least, f"fcd.{name}_mean_{unit}": mean.total / mean.count}
     return values
+
+
+def _spacings(batch: pa.Table) -> tuple[Floats, Floats]:
+    """Distance of each vehicle on a lane to the one ahead of it there, and its speed."""
+    on_lane = batch.filter(pc.and_(batch["lane"].is_valid(), batch["pos"].is_valid()))
+    lane = on_lane["lane"].combine_chunks().dictionary_encode().indices.to_numpy(zero_copy_only=False)
+    time, pos, speed = (on_lane[name].to_numpy() for name in ("time", "pos", "speed"))
+    order = np.lexsort((pos, lane, time))
+    time, lane, pos, speed = time[order], lane[order], pos[order], speed[order]
+    same = (time[1:] == time[:-1]) & (lane[1:] == lane[:-1])
+    return np.diff(pos)[same], speed[:-1][same]
 
 
 class _Mean:

@@ -1,9 +1,8 @@
-"""Reading SUMO's logs as streams, without trusting them: no document types, no entities, bounded memory, one clear line."""
+"""Bytes and elements of SUMO's logs, without trusting them: no document types, no entities, bounded memory, one clear line."""
 
 from __future__ import annotations
 
 import gzip
-import math
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,25 +10,14 @@ from pathlib import Path
 from typing import BinaryIO, cast
 from xml.parsers import expat
 
-import numpy as np
-import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
-
 from trainctl.errors import InputError
-from trainctl.signals import Floats
 
-CHUNK = 1 << 18  # bytes
-BATCH_ROWS = 1 << 16
+CHUNK = 1 << 14  # bytes: what lives no longer than this costs the garbage collector little
 #: A single element of an XML log longer than this [bytes] is not one of SUMO's.
 ELEMENT_BYTES = 1 << 22
-#: More vehicles than this in one time step are not believed.
-STEP_ROWS = 2_000_000
 
-#: Columns of a batch of FCD rows beside ``time_s`` and ``id``, and what they are called in CSV and Parquet.
-TEXTS = {"id": "vehicle_id", "lane": "vehicle_lane"}
-NUMBERS = {"time_s": "timestep_time", "speed": "vehicle_speed", "pos": "vehicle_pos"}
-NEEDED = ("time_s", "id", "speed")
+#: Byte order marks of text in two bytes per character.
+UTF16 = (b"\xff\xfe", b"\xfe\xff")
 
 
 def find_log(folder: Path, name: str) -> Path | None:
@@ -46,8 +34,12 @@ def kind_of(path: Path) -> str:
         head = stream.read(512)
     if head[:4] == b"PAR1":
         return "parquet"
-    text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
-    return "xml" if text[:1] == b"<" else "csv"
+    return "xml" if decoded(head).lstrip()[:1] == "<" else "csv"
+
+
+def decoded(head: bytes) -> str:
+    """The beginning of a file as text, whatever is damaged in it."""
+    return head.decode("utf-16" if head.startswith(UTF16) else "utf-8-sig", "replace")
 
 
 @contextmanager
@@ -76,161 +68,134 @@ def elements(path: Path, root: str, wanted: set[str]) -> Iterator[tuple[str, dic
     InputError
         Another root element, not well-formed, cut short, with a document type (entity bombs), or unreasonably long elements.
     """
-    found: list[tuple[str, dict[str, str]]] = []
-    depth = 0
-    parser = expat.ParserCreate()
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal depth
-        if depth == 0 and tag != root:
-            raise InputError(f"{path}: not a log of the kind <{root}>: its root is <{tag:.40}>")
-        depth += 1
-        if tag in wanted:
-            found.append((tag, attributes))
-
-    def end(tag: str) -> None:
-        nonlocal depth
-        depth -= 1
-
-    def refuse(*_: object) -> None:
-        raise InputError(f"{path}: line {parser.CurrentLineNumber}: has a document type or entities, which no log of SUMO has")
-
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
-    fed = 0
+    parser = Parser(path, root)
     with opened(path) as stream:
         while chunk := stream.read(CHUNK):
-            fed += len(chunk)
-            _feed(parser, path, chunk, False)
-            if fed - parser.CurrentByteIndex > ELEMENT_BYTES:
-                raise InputError(f"{path}: line {parser.CurrentLineNumber}: an element longer than {ELEMENT_BYTES >> 20} MiB")
-            yield from found
-            found.clear()
-        _feed(parser, path, b"", True)
-        yield from found
+            yield from _named(parser.feed(chunk), wanted)
+        yield from _named(parser.feed(b"", last=True), wanted)
 
 
-def _feed(parser: expat.XMLParserType, path: Path, chunk: bytes, last: bool) -> None:
-    try:
-        parser.Parse(chunk, last)
-    except expat.ExpatError as error:
-        raise InputError(f"{path}: not well-formed XML: {error}") from None
-    except (ValueError, LookupError) as error:  # an unknown encoding
-        raise InputError(f"{path}: {error}") from None
+def _named(found: list[Element], wanted: set[str]) -> Iterator[tuple[str, dict[str, str]]]:
+    for tag, attributes, _ in found:
+        if tag in wanted:
+            yield tag, dict(zip(attributes[::2], attributes[1::2], strict=True))
 
 
-def fcd_batches(path: Path) -> Iterator[pd.DataFrame]:
-    """Rows of an FCD log in pieces of whole time steps.
-
-    Yields
-    ------
-    DataFrame
-        ``time_s, id, speed`` and, where the log has them, ``lane, pos``; finite numbers only, never empty.
-    """
-    kind = kind_of(path)
-    pieces = {"xml": _fcd_xml, "csv": _fcd_csv, "parquet": _fcd_parquet}[kind](path)
-    held: list[pd.DataFrame] = []  # rows of a step that may go on in the next piece
-    for piece in pieces:
-        if piece.empty:
-            continue
-        numbers = [name for name in NUMBERS if name in piece.columns]
-        if not np.isfinite(piece[numbers].to_numpy()).all():
-            raise InputError(f"{path}: a number is missing or not finite near {piece['time_s'].iloc[0]} s")
-        last = piece["time_s"].to_numpy() == piece["time_s"].iloc[-1]
-        cut = len(piece) - (int(np.argmin(last[::-1])) if not last.all() else len(piece))
-        if cut:
-            yield pd.concat([*held, piece.iloc[:cut]], ignore_index=True)
-            held = []
-        elif held and held[0]["time_s"].iloc[0] != piece["time_s"].iloc[0]:
-            yield pd.concat(held, ignore_index=True)
-            held = []
-        held.append(piece.iloc[cut:])
-        if sum(map(len, held)) > STEP_ROWS:
-            raise InputError(f"{path}: more than {STEP_ROWS} vehicles at {piece['time_s'].iloc[-1]} s")
-    if held:
-        yield pd.concat(held, ignore_index=True)
+#: Tag, attributes (name, value, name, ...), and how many elements had ended since the piece it is in begins.
+Element = tuple[str, list[str], int]
 
 
-def _fcd_xml(path: Path) -> Iterator[pd.DataFrame]:
-    time = math.nan
-    rows: dict[str, list[str]] = {"id": [], "speed": [], "lane": [], "pos": []}
-    times: list[float] = []
-    for tag, attributes in elements(path, "fcd-export", {"timestep", "vehicle"}):
-        if tag == "timestep":
-            try:
-                time = float(attributes["time"])
-            except (KeyError, ValueError):
-                raise InputError(f"{path}: a timestep without a time") from None
-            continue
-        if "id" not in attributes or "speed" not in attributes:
-            raise InputError(f"{path}: a vehicle without id or speed at {time:g} s")
-        times.append(time)
-        for name, texts in rows.items():
-            texts.append(attributes.get(name, ""))
-        if len(times) >= BATCH_ROWS:
-            yield _from_texts(path, times, rows)
-            times, rows = [], {name: [] for name in rows}
-    if times:
-        yield _from_texts(path, times, rows)
+#: An element no log has, to ask where the parser is.
+PROBE = "trainctl.here"
+_PROBE = f"<{PROBE}/>".encode()
 
 
-def _from_texts(path: Path, times: list[float], rows: dict[str, list[str]]) -> pd.DataFrame:
-    columns: dict[str, object] = {"time_s": np.array(times), "id": rows["id"], "speed": _floats(path, rows["speed"], "speed")}
-    if all(rows["lane"]) and all(rows["pos"]):
-        columns |= {"lane": rows["lane"], "pos": _floats(path, rows["pos"], "pos")}
-    return pd.DataFrame(columns)
+class Parser:
+    """The strict parser, fed piece by piece; parts known to be whole elements of the root may be left out (``skip``)."""
 
+    def __init__(self, path: Path, root: str) -> None:
+        self.path, self.root = path, root
+        self.found: list[Element] = []
+        self.ended: list[str] = []
+        self.started = self.gone = 0  # elements begun and ended in earlier pieces
+        self.fed, self.lines = 0, 0  # bytes; lines that were left out
+        self.utf8: bool | None = None  # whether the log says so; None before its first bytes
+        self.comments: _Comments | None = None
+        self.parser = parser = expat.ParserCreate()
+        parser.ordered_attributes = True
+        parser.StartElementHandler = self._first
+        parser.EndElementHandler = self.ended.append
+        parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = self._refuse
 
-def _floats(path: Path, texts: list[str], name: str) -> Floats:
-    try:
-        return np.array([float(text) for text in texts])
-    except ValueError as error:
-        raise InputError(f"{path}: {name}: {error}") from None
+    def _first(self, tag: str, attributes: list[str]) -> None:
+        if tag != self.root:
+            raise InputError(f"{self.path}: not a log of the kind <{self.root}>: its root is <{tag:.40}>")
+        self.found.append((tag, attributes, 0))
+        found, ended = self.found, self.ended
 
+        def start(tag: str, attributes: list[str]) -> None:
+            found.append((tag, attributes, len(ended)))
 
-def _fcd_csv(path: Path) -> Iterator[pd.DataFrame]:
-    with opened(path) as stream:
-        head = stream.readline(1 << 16)
-    separator = next((s for s in ";,\t" if s.encode() in head), ";")
-    known = {name.strip().strip('"') for name in head.decode("utf-8", "replace").strip().split(separator)}
-    names = _columns(path, known)
-    with opened(path) as stream:
+        self.parser.StartElementHandler = start
+
+    def _refuse(self, *_: object) -> None:
+        line = self.parser.CurrentLineNumber + self.lines
+        raise InputError(f"{self.path}: line {line}: has a document type or entities, which no log of SUMO has")
+
+    def feed(self, data: bytes, last: bool = False) -> list[Element]:
+        """The elements that begin in these bytes.
+
+        Raises
+        ------
+        InputError
+            As ``elements`` does.
+        """
+        if self.comments is None:
+            self.comments = _Comments(not data.startswith(UTF16))
+        self._parse(self.comments.blanked(data, last), last)
+        found, self.found[:] = self.found.copy(), []
+        self.started += len(found)
+        self.gone += len(self.ended)
+        self.ended.clear()
+        return found
+
+    def _parse(self, data: bytes, last: bool) -> None:
+        self.fed += len(data)
         try:
-            reader = pd.read_csv(
-                stream, sep=separator, usecols=list(names.values()), chunksize=BATCH_ROWS, dtype=dict.fromkeys(TEXTS.values(), str),
-                keep_default_na=False, na_values={name: [""] for name in NUMBERS.values()}, encoding_errors="strict",
-            )  # fmt: skip
-            for piece in reader:
-                piece = piece.rename(columns={file: ours for ours, file in names.items()})
-                piece = piece[piece["id"] != ""]  # as in Parquet
-                yield piece.astype({name: np.float64 for name in names if name in NUMBERS})
-        except (pd.errors.ParserError, pd.errors.EmptyDataError, ValueError) as error:
-            raise InputError(f"{path}: not an FCD log: {str(error).splitlines()[0] if str(error) else 'empty'}") from None
+            self.parser.Parse(data, last)
+        except expat.ExpatError as error:
+            told = f"{expat.errors.messages[error.code]}: line {error.lineno + self.lines}, column {error.offset}"
+            raise InputError(f"{self.path}: not well-formed XML: {told}") from None
+        except (ValueError, LookupError) as error:  # an unknown encoding
+            raise InputError(f"{self.path}: {error}") from None
+        if not last and self.fed - self.parser.CurrentByteIndex > ELEMENT_BYTES:
+            line = self.parser.CurrentLineNumber + self.lines
+            raise InputError(f"{self.path}: line {line}: an element longer than {ELEMENT_BYTES >> 20} MiB")
+
+    def between(self) -> bool:
+        """Whether all that was fed is read, and the next byte stands in the root, outside any other element or comment."""
+        if self.comments is None or self.comments.open or self.started - self.gone != 1:
+            return False
+        self._parse(_PROBE, False)  # in a comment, a CDATA section, an instruction it is no element
+        seen = [tag for tag, *_ in self.found] == [PROBE]
+        self.started, self.gone = self.started + len(self.found), self.gone + len(self.ended)
+        self.found.clear()
+        self.ended.clear()
+        return seen and self.started - self.gone == 1
+
+    def skip(self, data: bytes) -> None:
+        """Leave out a part that is known to be well-formed."""
+        self.lines += data.count(b"\n")
 
 
-def _fcd_parquet(path: Path) -> Iterator[pd.DataFrame]:
-    try:
-        with pq.ParquetFile(path) as file:
-            known = file.schema_arrow.names
-            names = _columns(path, set(known))
-            if any(known.count(theirs) > 1 for theirs in names.values()):
-                raise InputError(f"{path}: not an FCD log: a column stands more than once")
-            for batch in file.iter_batches(batch_size=BATCH_ROWS, columns=list(names.values())):
-                piece = batch.to_pandas().rename(columns={file: ours for ours, file in names.items()})
-                piece = piece[piece["id"].notna()].copy()  # a step without vehicles is a row without a vehicle
-                for name in names:
-                    piece[name] = piece[name].astype(np.float64 if name in NUMBERS else str)
-                yield piece
-    except (pa.ArrowException, OSError, ValueError, TypeError) as error:
-        raise InputError(f"{path}: not an FCD log: {str(error).partition(chr(10))[0]}") from None
+class _Comments:
+    """Comments may be in any encoding (SUMO copies its configuration into one): blanks instead, byte by byte."""
 
+    BLANKS = bytes(byte if byte in b"\r\n" else 0x20 for byte in range(256))
 
-def _columns(path: Path, known: set[str]) -> dict[str, str]:
-    """Our names of the columns that are there -> theirs."""
-    names = {ours: theirs for ours, theirs in (TEXTS | NUMBERS).items() if theirs in known}
-    missing = [(TEXTS | NUMBERS)[name] for name in NEEDED if name not in names]
-    if missing:
-        raise InputError(f"{path}: not an FCD log: no column {', '.join(missing)}")
-    if not {"lane", "pos"} <= names.keys():
-        names = {name: names[name] for name in NEEDED}
-    return names
+    def __init__(self, wanted: bool) -> None:
+        self.wanted, self.inside, self.held = wanted, False, b""
+
+    @property
+    def open(self) -> bool:
+        """Whether the bytes to come may belong to a comment."""
+        return self.inside or bool(self.held)
+
+    def blanked(self, data: bytes, last: bool) -> bytes:
+        """The bytes with blanks in comments; a few may be held back until the next call."""
+        if not self.wanted or (not self.open and b"<!" not in data and not data.endswith(b"<")):
+            return data
+        data, place, out = self.held + data, 0, []
+        while True:
+            end = data.find(b"-->" if self.inside else b"<!--", place)
+            if end < 0:
+                break
+            out.append(data[place:end].translate(self.BLANKS) if self.inside else data[place:end])
+            out.append(b"-->" if self.inside else b"<!--")
+            place, self.inside = end + len(out[-1]), not self.inside
+        rest, mark = data[place:], b"-->" if self.inside else b"<!--"
+        keep = 0 if last else next(k for k in (3, 2, 1, 0) if k < len(mark) and rest.endswith(mark[:k]))
+        self.held = rest[len(rest) - keep :]
+        rest = rest[: len(rest) - keep]
+        out.append(rest.translate(self.BLANKS) if self.inside else rest)
+        return b"".join(out)

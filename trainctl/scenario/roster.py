@@ -16,8 +16,8 @@ from sumo_net.layout import Gradient
 from trainctl.errors import InputError
 from trainctl.scenario.tables import Scenario, Train, TrainType
 from trainctl.scenario.tables import Traffic as Driving
+from trainctl.scenario.train_types import train_type
 from trainctl.signals import Bools, Floats, Ints
-from trainctl.traffic.kinds import train_type
 from trainctl.traffic.read import Departure, Traffic, read_traffic
 
 

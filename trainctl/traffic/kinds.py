@@ -6,21 +6,12 @@ import re
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
-from pydantic import ValidationError
-
-from trainctl.scenario.tables import TrainType
-from trainctl.traffic.files import bad_number
-
 #: Length [m] and greatest speed [m/s] of SUMO's vehicle classes.
 _CLASS = {
     "rail": (135.0, 160 / 3.6), "rail_electric": (200.0, 220 / 3.6), "rail_fast": (200.0, 330 / 3.6),
     "rail_urban": (109.5, 100 / 3.6),
     "tram": (22.0, 80 / 3.6), "subway": (109.5, 100 / 3.6), "cable_car": (5.0, 200 / 3.6),
 }  # fmt: skip
-
-
-#: What a vType must say to be a plant of ours, in SUMO's units: kg, kW, kN, and kN with m/s.
-_CONSTANTS = ("mass", "maxPower", "maxTraction", "resCoef_constant", "resCoef_linear", "resCoef_quadratic")
 
 
 class Built(NamedTuple):
@@ -34,7 +25,7 @@ class Built(NamedTuple):
 
 
 #: Train types of SUMO's Rail model; the mass of "custom" stands for no train.
-_RAIL_MODEL = {
+RAIL_MODEL = {
     "NGT400": Built(200.0, 500 / 3.6, 384e3, 1.04, 0.9),
     "NGT400_16": Built(200.0, 430 / 3.6, 384e3, 1.04, 0.9),
     "ICE1": Built(358.0, 250 / 3.6, 876e3, 1.1, 0.5),
@@ -68,7 +59,7 @@ def kind_of(element: Element) -> Kind:
             said |= {"carFollowModel": child.tag.partition("-")[2], **child.attrib}
     vclass = said.get("vClass", "passenger")
     length, speed = _CLASS.get(vclass, (5.0, 200 / 3.6))
-    if said.get("carFollowModel") == "Rail" and (built := _RAIL_MODEL.get(said.get("trainType", "NGT400"))) is not None:
+    if said.get("carFollowModel") == "Rail" and (built := RAIL_MODEL.get(said.get("trainType", "NGT400"))) is not None:
         length, speed = built.length_m, built.speed_mps
     # A distribution, norm(mean, deviation) or normc(mean, ...): its mean.
     factor = re.search(r"[-+.\d][-+.\deE]*", said.get("speedFactor", "1"))
@@ -80,53 +71,6 @@ def kind_of(element: Element) -> Kind:
         speed_factor=float(factor[0]) if factor else 1.0,
         attributes=said,
     )
-
-
-def train_type(kind: Kind) -> TrainType | list[str]:
-    """Physical data of a vType with SUMO's Rail model and constants of its own; else what it lacks, one line.
-
-    Notes
-    -----
-    SUMO's Rail model takes ``maxPower`` in kW, ``maxTraction`` and ``resCoef_*`` in kN with speeds in m/s, ``mass`` in kg; the
-    traction is the smaller of ``maxTraction`` and ``maxPower`` over the speed, ``decel`` is braking effort over inertia. The train
-    types built into SUMO are tables of speed and force, which no key of ours can hold.
-    """
-    said = kind.attributes
-    rail, base = said.get("carFollowModel") == "Rail", said.get("trainType", "NGT400")
-    built = _RAIL_MODEL.get(base, _RAIL_MODEL["custom"])
-    # Any other model takes notice of the mass alone.
-    value = {key: said[key] for key in _CONSTANTS if key in said and (rail or key == "mass")}
-    if rail and base != "custom" and base in _RAIL_MODEL:
-        value.setdefault("mass", str(built.mass_kg))
-    if lacking := [f"no {key}" for key in _CONSTANTS if key not in value]:
-        why = f" (SUMO has trainType {base} as tables)" if rail and base != "custom" and base in _RAIL_MODEL else ""
-        return [
-            f"vType {kind.id}: {', '.join(lacking)}{why}: add [train_type.{kind.id}] to the scenario, or"
-            f' carFollowModel="Rail" trainType="custom" with {", ".join(_CONSTANTS)} to the vType'
-        ]
-    checked = {key: said[key] for key in ("massFactor", "decel") if key in said} | value
-    if mistakes := [
-        f"vType {kind.id}: {key} = {text}: must be a number, not negative" for key, text in checked.items() if bad_number(text)
-    ]:
-        return mistakes
-    mass, power, traction, c0, c1, c2 = (float(value[key]) for key in _CONSTANTS)
-    if mass <= 0:
-        return [f"vType {kind.id}: mass = {mass:g}: must be above 0"]
-    factor = float(said.get("massFactor", built.mass_factor))
-    try:
-        return TrainType(
-            unit_length_m=kind.length_m,
-            unit_mass_kg=mass,
-            rotating_mass_factor=factor,
-            c0_n_per_kg=1e3 * c0 / mass,
-            c1_ns_per_m_kg=1e3 * c1 / mass,
-            c2_ns2_per_m2_kg=1e3 * c2 / mass,
-            traction_n=1e3 * traction,
-            traction_power_w=1e3 * power,
-            braking_n=float(said.get("decel", built.deceleration_mps2)) * mass * factor,
-        )
-    except ValidationError as error:
-        return [f"vType {kind.id}: {e['msg'].removeprefix('Value error, ')}" for e in error.errors()]
 
 
 def default_types() -> dict[str, Element]:

@@ -1,0 +1,215 @@
+"""Blocks of XML exactly as SUMO writes it: one row a line, the same attributes in the same order, nothing else.
+
+A block is read as CSV whose separator is the quotation mark: texts between two marks are values, and texts outside are literal
+(`` speed=``). It is regular if the rows of one form (one element, one number of attributes) have the same literals, if every line
+holds one element, and if nothing stands in it that XML would read in another way: then it is well-formed, and what the strict
+parser would find is what the columns hold. Any doubt makes the block irregular, and the strict parser decides.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pc_csv
+
+from trainctl.runs.kinds import Kind
+from trainctl.signals import Ints
+
+_NAME = rb"([A-Za-z_][A-Za-z0-9_.-]*)"
+_FIRST = re.compile(rb" *<" + _NAME + rb" +" + _NAME + rb"=")
+_NEXT = re.compile(rb" +" + _NAME + rb"=")
+_LAST = re.compile(rb" */>")
+#: Different rows in a block, by element and number of attributes.
+MOST_FORMS = 8
+#: Attributes of a regular row; each is two columns.
+MOST_ATTRIBUTES = 100
+
+_PARSE = pc_csv.ParseOptions(delimiter='"', quote_char=False, double_quote=False, escape_char=False, ignore_empty_lines=False)
+
+
+def regular_rows(block: bytes, kind: Kind, wanted: frozenset[str]) -> pa.Table | None:
+    """Rows of a block of whole time steps; None if the block is not regular.
+
+    Parameters
+    ----------
+    block : bytes
+        Part of a log in UTF-8 that begins and ends within its root, outside any other element.
+    kind : Kind
+        A kind with steps.
+    wanted : frozenset of str
+        Elements that are rows; others of the kind are left out.
+    """
+    element = kind.step.encode()
+    found = _lines(block, element) if block.endswith(b"</" + element + b">") and _plain(block) else None
+    if found is None:
+        return None
+    times, text, step = found
+    parts = _rows(text, len(step), kind)
+    if parts is None:
+        return None
+    tables, places = [], []
+    for tag, which, part in parts:
+        if "time" in part.column_names:
+            return None
+        if tag in wanted:
+            tables.append(part.add_column(0, "time", times.take(pa.array(step[which]))))
+            places.append(np.arange(len(step))[which])
+    return in_order(tables, places) if tables else pa.table({})
+
+
+_NEWLINE, _RETURN, _MARK, _SLASH, _LESS = b'\n\r"/<'
+
+
+def _plain(block: bytes) -> bool:
+    """Whether nothing stands in a block that XML reads in another way, or not at all: references, control characters, tabs."""
+    if b"&" in block:
+        return False
+    bytes_ = np.frombuffer(block, np.uint8)
+    returns = int(np.count_nonzero(bytes_ == _RETURN)) if b"\r" in block else 0
+    if np.count_nonzero(bytes_ < 0x20) != np.count_nonzero(bytes_ == _NEWLINE) + returns:
+        return False
+    if block.isascii():
+        return True
+    try:
+        return not {"\ufffe", "\uffff"} & set(block.decode())  # no characters
+    except UnicodeDecodeError:
+        return False
+
+
+def in_order(parts: list[pa.Table], places: Sequence[Sequence[int] | Ints]) -> pa.Table:
+    """Tables of some rows each as one table, every row in its place."""
+    if len(parts) == 1:
+        return parts[0]
+    whole = pa.concat_tables(parts, promote_options="default").combine_chunks()
+    return whole.take(pa.array(np.argsort(np.concatenate([np.asarray(p, np.int64) for p in places]))))
+
+
+def _lines(block: bytes, step: bytes) -> tuple[pa.Array, bytes, Ints] | None:
+    """Times of the steps, all rows (a line each), and the number of the step each row is in."""
+    bytes_ = np.frombuffer(block, np.uint8)
+    ends = np.append(np.flatnonzero(bytes_ == _NEWLINE), len(block))
+    begins = np.append(0, ends[:-1] + 1)
+    marks = np.flatnonzero(bytes_ == _LESS)
+    if len(marks) < 2 or len(ends) - len(marks) not in (0, 1):
+        return None
+    if len(ends) > len(marks):  # what is left of the line in which the last block ended
+        if block[: ends[0]].strip():
+            return None
+        begins, ends = begins[1:], ends[1:]
+    if (marks < begins).any() or (marks >= ends).any():  # one in every line
+        return None
+    letters = bytes_[marks + 1]
+    opening, closing = letters == step[0], letters == _SLASH
+    empty = opening & (bytes_[ends - 2 - (bytes_[ends - 1] == _RETURN)] == _SLASH)
+    row = ~(opening | closing)
+    change = (opening & ~empty).astype(np.int64) - closing
+    depth = np.cumsum(change) - change  # before each line
+    if (depth[opening] != 0).any() or (depth[~opening] != 1).any() or not closing[-1]:
+        return None
+    if _joined(block, begins[closing], ends[closing] + 1).replace(b"</" + step + b">", b"").strip():
+        return None
+    times = np.empty(int(np.count_nonzero(opening)), object)
+    for lines, last in ((opening & ~empty, rb" *>"), (empty, rb" */>")):
+        told = _times(_joined(block, begins[lines], ends[lines] + 1), int(np.count_nonzero(lines)), step, last)
+        if told is None:
+            return None
+        times[lines[opening]] = told
+    rows = np.flatnonzero(row)
+    firsts = np.flatnonzero(np.diff(rows, prepend=-2) > 1)  # of each run of rows
+    lasts = np.append(firsts[1:], len(rows))[: len(firsts)] - 1
+    column = pa.array([time.decode() or None for time in times.tolist()], pa.string())
+    return column, _joined(block, begins[rows[firsts]], ends[rows[lasts]] + 1), np.cumsum(opening)[rows] - 1
+
+
+def _times(text: bytes, count: int, step: bytes, last: bytes) -> list[bytes] | None:
+    """The times of so many steps, whose beginnings stand a line each, with such an end; None if they are not alike."""
+    if not count:
+        return []
+    pieces = text.split(b'"')
+    first, rest = pieces[0], pieces[-1]
+    if len(pieces) != 2 * count + 1 or not re.fullmatch(rb" *<" + step + rb" +time=", first):
+        return None
+    if not re.fullmatch(last + rb"\r?\n", rest) or not {*pieces[2:-1:2]} <= {rest + first}:
+        return None
+    return pieces[1::2]
+
+
+def _joined(block: bytes, begins: Ints, ends: Ints) -> bytes:
+    return b"".join([block[begin:end] for begin, end in zip(begins.tolist(), ends.tolist(), strict=True)])
+
+
+#: Element, its rows among all, their values.
+_Part = tuple[str, Ints | slice, pa.Table]
+
+
+def _rows(text: bytes, count: int, kind: Kind) -> list[_Part] | None:
+    """So many rows, a line each, by element; None if those of one element with as many attributes are not alike."""
+    if not count:
+        return []
+    bytes_ = np.frombuffer(text, np.uint8)
+    letters = bytes_[np.flatnonzero(bytes_ == _LESS) + 1].astype(np.int64)
+    quotes = np.count_nonzero(bytes_ == _MARK)
+    if (letters == letters[0]).all() and quotes == count * text.count(b'"', 0, text.index(b"\n")):
+        whole = _rows_of(text, count, _tag(chr(letters[0]), kind))
+        return None if whole is None else [(_tag(chr(letters[0]), kind).decode(), slice(None), whole)]
+    ends = np.flatnonzero(bytes_ == _NEWLINE) + 1
+    begins = np.append(0, ends[:-1])
+    form = 256 * np.diff(np.searchsorted(np.flatnonzero(bytes_ == _MARK), ends), prepend=0) + letters
+    forms = np.unique(form)
+    if len(forms) > MOST_FORMS:
+        return None
+    out: list[_Part] = []
+    for one in forms.tolist():
+        which, tag = np.flatnonzero(form == one), _tag(chr(one % 256), kind)
+        part = _rows_of(_joined(text, begins[which], ends[which]), len(which), tag)
+        if part is None:
+            return None
+        out.append((tag.decode(), which, part))
+    return out
+
+
+def _tag(letter: str, kind: Kind) -> bytes:
+    """The element of the kind's that begins with a letter."""
+    return next((row for row in kind.rows if row.startswith(letter)), "").encode()
+
+
+def _rows_of(text: bytes, rows: int, tag: bytes) -> pa.Table | None:
+    """The values of so many lines of one element, all alike; None if they are not."""
+    literals = text[: text.find(b"\n")].rstrip(b"\r").split(b'"')[::2]
+    if not 2 <= len(literals) <= MOST_ATTRIBUTES:
+        return None
+    first, others = _FIRST.fullmatch(literals[0]), [_NEXT.fullmatch(literal) for literal in literals[1:-1]]
+    if first is None or first[1] != tag or None in others or not _LAST.fullmatch(literals[-1]):
+        return None
+    names = [first[2].decode(), *(other[1].decode() for other in others if other is not None)]
+    if len(set(names)) < len(names) or any(name.startswith("xmlns") for name in names):
+        return None
+    columns = [f"{k}" for k in range(2 * len(names) + 1)]
+    try:
+        table = pc_csv.read_csv(
+            pa.py_buffer(text),
+            read_options=pc_csv.ReadOptions(use_threads=False, block_size=len(text) + 1, column_names=columns),
+            parse_options=_PARSE,
+            convert_options=pc_csv.ConvertOptions(
+                column_types=dict.fromkeys(columns[1::2], pa.string())
+                | {name: pa.binary(len(literal)) for name, literal in zip(columns[::2], literals, strict=True)},
+                strings_can_be_null=True, null_values=[""],
+            ),
+        )  # fmt: skip
+    except pa.ArrowException:  # another number of values in a line, a literal of another length, not UTF-8
+        return None
+    if table.num_rows != rows:
+        return None
+    if not all(_only(table[name], literal) for name, literal in zip(columns[::2], literals, strict=True)):
+        return None
+    return table.select(columns[1::2]).rename_columns(names)
+
+
+def _only(column: pa.ChunkedArray, literal: bytes) -> bool:
+    """Whether a column of texts of one length holds nothing but this one."""
+    texts = column.combine_chunks()
+    there = np.frombuffer(texts.buffers()[1], np.uint8)[: len(texts) * len(literal)].reshape(len(texts), len(literal))
+    return not column.null_count and bool((there == np.frombuffer(literal, np.uint8)).all())
