@@ -320,7 +320,7 @@ def peak_mb() -> float:
 def inputs(folder: Path, case: str, trains: int, steps: int) -> None:
     """Write what SUMO alone needs into ``folder``: net, trains and configuration, as a run does."""
     import sumo_net
-    from trainctl.loop import Simulation
+    from trainctl.loop import Loop
     from trainctl.numeric import Numeric
     from trainctl.scenario.build import open_scenario
     from trainctl.stages.record import Journal
@@ -333,7 +333,7 @@ def inputs(folder: Path, case: str, trains: int, steps: int) -> None:
         def start(self, start: Any) -> None:
             write_routes(start, folder / "trains.rou.xml")
 
-    Simulation(prepared, Writer(prepared.line), Journal(folder, prepared))
+    Loop(prepared, Writer(prepared.line), Journal(folder, prepared))
     configuration = write_configuration(folder, f"{prepared.spec.name}.net.xml", "trains.rou.xml", 1.0, steps + 1.0)
     logs = [part for key, name in LOGS.items() for part in (f"--{key}", str(folder / name))]
     (folder / "command.json").write_text(json.dumps(["sumo", "-c", str(configuration), *logs]), encoding="utf-8")
@@ -416,7 +416,7 @@ def closed(folder: Path, case: str) -> Case:
     """Our loop: in SUMO, through TraCI, or numeric."""
     if case == "traci":
         sys.modules["libsumo"] = through_traci()
-    from trainctl.loop import Simulation
+    from trainctl.loop import Loop
     from trainctl.runner import open_world
     from trainctl.scenario.build import open_scenario
     from trainctl.stages.record import Journal
@@ -429,14 +429,14 @@ def closed(folder: Path, case: str) -> Case:
     clock = Clock()
     journal = Journal(folder, prepared)
     world: Any = open_world(prepared, folder, "sumo" if case in IN_SUMO else "numeric")
-    simulation = Simulation(prepared, world, journal)
-    simulation.step()  # compiles or loads what the kernels need
-    clock.around(simulation, "_measure", "read")
-    clock.around(simulation, "_topology", "topology")
-    clock.around(simulation, "_control", "control")
-    clock.around(simulation.motion, "advance", "plant")
-    clock.around(simulation, "_check", "plant")
-    clock.around(simulation, "_record", "record")
+    loop = Loop(prepared, world, journal)
+    loop.step()  # compiles or loads what the kernels need
+    clock.around(loop, "_measured", "read")
+    clock.around(loop.topology, "step", "topology")
+    clock.around(loop.control, "step", "control")
+    clock.around(loop.plant, "step", "plant")
+    clock.around(loop, "_check", "plant")
+    clock.around(loop.record, "step", "record")
     clock.around(world, "move", "write")
     clock.around(world, "close", "step")
     clock.around(journal, "close", "record")
@@ -450,7 +450,7 @@ def closed(folder: Path, case: str) -> Case:
         world.close()
         journal.close()
 
-    return Case(len(prepared.scenario.ids), simulation.step, close, clock)
+    return Case(len(prepared.scenario.ids), loop.step, close, clock)
 
 
 def public(folder: Path, case: str) -> Case:

@@ -236,7 +236,15 @@ class Simulation:
 
     @property
     def reference(self) -> tuple[float, float]:
-        """Position [m] and speed [m/s] of the reference now."""
+        """Position [m] and speed [m/s] of the scenario's reference now, which all trains share.
+
+        Raises
+        ------
+        InputError
+            Trains come and go: every formation has a reference of its own, see ``reference_of``.
+        """
+        if not self._loop.p.placed:
+            raise InputError("reference: every formation of a SUMO configuration has its own: ask reference_of(train)")
         position, speed = self._loop.p.leader(self.time)[:2]
         return float(position), float(speed)
 
@@ -268,6 +276,18 @@ class Simulation:
             }
         )  # fmt: skip
 
+    def reference_of(self, train: str) -> tuple[float, float]:
+        """Position [m] along the train's own way and speed [m/s] of the reference it follows now.
+
+        Where trains come and go that is the reference of its formation; a train in none follows nobody but itself.
+        """
+        i, formed = self._number(train), self._loop.state.formed
+        if formed.pace is None:
+            return self.reference
+        if not formed.led[i]:
+            return float(self.position_m[i]), float(self.speed_mps[i])
+        return float(formed.pace.position[i] - formed.offset[i]), float(formed.pace.speed[i])
+
     def step(self, steps: int = 1) -> float:
         """Go on by so many steps; returns the time [s]."""
         for _ in range(steps):
@@ -279,7 +299,8 @@ class Simulation:
     def command(self, acceleration_mps2: Mapping[str, float]) -> None:
         """Drive trains from outside: from the next step on they are asked for this acceleration, not for the law's.
 
-        The limits of the plant, and a law's own clamps of speed and input, still apply.
+        The limits of the plant still apply, and so do the clamps of speed and input of a law that drives the train; the supervisor
+        acts as on anybody. A train in no formation is commanded like any other; one that stands at a stop stays there.
 
         Parameters
         ----------

@@ -138,22 +138,22 @@ class Loop(Steps):
         )  # fmt: skip
 
     def end(self) -> None:
-        """The last instant, which nothing acts on: arrivals, but no entries or orders; watched and recorded as any other."""
+        """The last instant, from which nobody moves on: no orders, no entries; else sorted, watched and recorded as any other."""
         s, world, t = self.state, self.world, self.time
         own, here, ways = self._measured(s), world.measure(), world.ways
-        going = self.traffic.arrivals(t, here, s.traffic)
+        late = self.plant.overrun(own, self.p.driver_rules.service_mps2)
+        going, around = self.traffic.step(t, ways, here, own[self.p.heads, SPEED].copy(), late, s.traffic, last=True)
         seen = here._replace(position=here.position + s.formed.offset)
-        rule, formed, messages, units = s.rule, s.formed, s.messages, s.plant
-        if self.p.placed:
-            nobody = traffic.nothing(len(own[self.p.heads]))
-            rule, formed, messages, own, seen, scene = self.topology.step(t, seen, own, nobody, going, rule, formed, messages)
-            units = units if scene is None else self._relinked(t, scene, formed, units, s.watch)
+        rule, formed, messages, own, seen, scene = self.topology.step(
+            t, seen, own, around, going, s.rule, s.formed, s.messages
+        )  # fmt: skip
+        units = s.plant if scene is None else self._relinked(t, scene, formed, s.plant, s.watch)
         past, units = self.plant.taken(units)
         self.record.step(s.k, t, ways, here, seen, own, formed, s.demand, None, past, None, s.watch)
-        late = self.traffic.missing(t, going)
-        self.not_entered = len(late)
-        if late:
-            self.journal.event(t, "not_entered", trains=late)
+        missing = self.traffic.missing(t, going)
+        self.not_entered = len(missing)
+        if missing:
+            self.journal.event(t, "not_entered", trains=missing)
         self.state = s._replace(
             own=own, traffic=going, rule=rule, formed=formed, messages=messages, plant=units
         )  # fmt: skip
@@ -185,7 +185,8 @@ class Loop(Steps):
             ways = lay_out(p.line, start)
             row = ways.first[:-1]
             nobody = Seen(ways.begin[row] + start.lane_position, ways.edge[row], row, start.present)
-            going, _, entries, _ = self.traffic.entering(0.0, ways, nobody, speed.copy(), s.traffic)
+            due = self.traffic.due(0.0, s.traffic)
+            going, _, entries, _ = self.traffic.entering(0.0, ways, nobody, speed.copy(), s.traffic, due)
             for i, v in entries:
                 start.present[i], start.speed[i] = True, v
                 s.own[first[i] : first[i + 1], SPEED] = v

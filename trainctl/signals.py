@@ -184,6 +184,10 @@ class SampledLaw(Protocol):
     """A train-level law evaluated once per control period: a module of this shape in ``trainctl.controllers``.
 
     ``demand`` must be local: the input of a train depends on its own rows and on what the links bring it.
+
+    A law that keeps something from one control instant to the next has ``initial(params, scene)``, its state at the first one:
+    arrays and numbers in (named) tuples, one row per train. Its ``demand`` then takes that as the last argument and returns
+    ``(Demand, state)``; it must not write into what it was given. The state lies in the loop's and in every checkpoint.
     """
 
     CLOCK: Literal["sampled"]

@@ -81,7 +81,7 @@ def check_finite_even_far_out_and_on_stale_messages(x: Example) -> None:
     sent = heard(x, constants, own, hearing)
     for missing in range(len(hearing.sender)):
         some = hearing._replace(heard=np.arange(len(hearing.sender)) != missing)
-        assert np.isfinite(x.law.demand(constants, trains(own), LEADER, some, sent).acceleration).all()
+        assert np.isfinite(asked(x, constants, trains(own), LEADER, some, sent).acceleration).all()
 
 
 def check_repeatable_and_inputs_untouched(x: Example) -> None:
@@ -91,8 +91,8 @@ def check_repeatable_and_inputs_untouched(x: Example) -> None:
     sent = heard(x, constants, own, hearing)
     arguments: tuple[Any, ...] = (trains(own), LEADER, hearing, sent)
     copies = deepcopy(arguments)
-    first = x.law.demand(constants, *arguments)
-    second = x.law.demand(constants, *arguments)
+    first = asked(x, constants, *arguments)
+    second = asked(x, constants, *arguments)
     for one, two in zip(first, second, strict=True):
         np.testing.assert_array_equal(one, two)
     for now, then in zip(arguments, copies, strict=True):
@@ -112,8 +112,8 @@ def check_local(x: Example) -> None:
     for other in range(N):
         moved = own.copy()
         moved[other] += (-777.0, 3.3)
-        frozen = x.law.demand(constants, trains(moved), LEADER, hearing, sent)
-        live = x.law.demand(constants, trains(moved), LEADER, hearing, heard(x, constants, moved, hearing))
+        frozen = asked(x, constants, trains(moved), LEADER, hearing, sent)
+        live = asked(x, constants, trains(moved), LEADER, hearing, heard(x, constants, moved, hearing))
         strangers = np.arange(N) != other
         neighbours = np.isin(np.arange(N), hearing.receiver[hearing.sender == other])
         for after, same in ((frozen, strangers), (live, strangers & ~neighbours)):
@@ -137,7 +137,7 @@ def check_numbering_of_the_trains_does_not_matter(x: Example) -> None:
     mirrored = np.ascontiguousarray(own[::-1])
     sc = scene(x, mirrored)._replace(links=turned)
     constants = x.law.constants(x.params, sc)
-    found = x.law.demand(constants, trains(mirrored), LEADER, turned, heard(x, constants, mirrored, turned))
+    found = asked(x, constants, trains(mirrored), LEADER, turned, heard(x, constants, mirrored, turned))
     np.testing.assert_allclose(found.acceleration[::-1], expected, atol=1e-12)
 
 
@@ -221,17 +221,29 @@ def demand(x: Example, own: Floats) -> Demand:
     """What the law asks for in this state, all messages fresh."""
     hearing = links(x)
     constants = x.law.constants(x.params, scene(x, own))
-    found: Demand = x.law.demand(constants, trains(own), LEADER, hearing, heard(x, constants, own, hearing))
-    return found
+    return asked(x, constants, trains(own), LEADER, hearing, heard(x, constants, own, hearing))
+
+
+def asked(x: Example, constants: Any, own: Trains, leader: Floats, hearing: Links, sent: Floats) -> Demand:
+    """What the law asks for; one that keeps a state of its own, at its first instant."""
+    state = []
+    if hasattr(x.law, "initial"):
+        state = [x.law.initial(x.params, scene(x, np.column_stack((own.position, own.speed))))]
+    found = x.law.demand(constants, own, leader, hearing, sent, *state)
+    demanded: Demand = found[0] if state else found
+    return demanded
 
 
 def run(x: Example, own: Floats, periods: int) -> Floats:
     """State of the point plant, shape (n, 2), after so many periods of 1 s."""
     sc = scene(x, own)
     constants, plant = x.law.constants(x.params, sc), point.constants(point.Params(), sc.consists)
+    state = [x.law.initial(x.params, sc)] if hasattr(x.law, "initial") else []
     for k in range(periods):
         leader = np.array([LEADER[0] + LEADER[1] * k, LEADER[1], 0.0, 0.0])
         sent = x.law.message(constants, trains(own), leader)[sc.links.sender]
-        asked = x.law.demand(constants, trains(own), leader, sc.links, sent)
-        own = point.advance(plant, own, asked.acceleration, 1.0, point.Kick.none(N)).own
+        found = x.law.demand(constants, trains(own), leader, sc.links, sent, *state)
+        if state:
+            found, *state = found
+        own = point.advance(plant, own, found.acceleration, 1.0, point.Kick.none(N)).own
     return own

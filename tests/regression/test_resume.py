@@ -18,7 +18,7 @@ import pytest
 import tomli_w
 
 from trainctl.errors import InputError
-from trainctl.loop import Simulation
+from trainctl.loop import Loop
 from trainctl.record.folder import remove
 from trainctl.runner import Backend, opened, resume, run
 from trainctl.runs.run import Run
@@ -172,7 +172,7 @@ def assert_resumed(prepared: Prepared, place: Path, backend: Backend, shares: tu
     class Stop(Exception):
         pass
 
-    def stopped(simulation: Simulation, share: float) -> None:
+    def stopped(simulation: Loop, share: float) -> None:
         while simulation.k < round(share * steps):
             simulation.step()
         raise Stop
@@ -182,7 +182,7 @@ def assert_resumed(prepared: Prepared, place: Path, backend: Backend, shares: tu
     remove(place / "configuration")
     for share in shares[1:]:
         with pytest.MonkeyPatch.context() as patch, pytest.raises(Stop):
-            patch.setattr(Simulation, "run", lambda simulation, _, share=share: stopped(simulation, share))
+            patch.setattr(Loop, "run", lambda simulation, _, share=share: stopped(simulation, share))
             resume(folder)
     last = round(shares[-1] * steps)
     failed = Run(place / "run.partial").info

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import nets
+import numpy as np
 import pandas as pd
 import pytest
 import tomli_w
@@ -13,6 +14,8 @@ import trainctl
 from trainctl.runner import opened, resume, run
 from trainctl.runs.run import Run
 from trainctl.scenario.build import open_scenario
+from trainctl.stages.driver import Driven, Driver
+from trainctl.stages.traffic import Traffic
 from trainctl.studies.results import write_results
 from trainctl.studies.sweep import Plan, jobs, simulate
 from trainctl.sumo.session import collisions
@@ -128,12 +131,8 @@ def head_on(tmp_path_factory):
 @pytest.mark.parametrize("backend", ["numeric", "sumo"])
 def test_unsupervised_on_a_net(head_on, backend, tmp_path, monkeypatch):
     """The driver is blind, too: only then do they meet."""
-    from trainctl.stages.convoys import Service
-
-    monkeypatch.setattr(Service, "drive", lambda self, seen, speed, view, stops: 0.0 * speed)
-    # at their places when their time comes, whoever comes towards them
-    monkeypatch.setattr(Service, "entering_speed", lambda self, i, speed, view: 35.0)
-    monkeypatch.setattr("trainctl.loop.Simulation._entering", _let_in)
+    monkeypatch.setattr(Driver, "step", _blind)
+    monkeypatch.setattr(Traffic, "entering", _let_in)
     done = run(open_scenario(str(head_on)), tmp_path / "r", backend)
     (told,) = violations(done, "gap_m")
     assert set(told["trains"]) == {"up", "down"} and told["edge"] in ("ab", "-ab")
@@ -143,18 +142,20 @@ def test_unsupervised_on_a_net(head_on, backend, tmp_path, monkeypatch):
         assert done.metrics["traffic.collisions"] == 1
 
 
-def _let_in(self, t, ways, here):
-    """Everybody enters at once, whoever has the track."""
-    import numpy as np
+def _blind(self, speed, acceleration, around, traffic, formed, commanded):
+    """Nobody brakes, whatever is ahead."""
+    return Driven(np.zeros(self.n), np.zeros(self.n, bool)), formed
 
-    asking = np.zeros(len(here.position), bool)
-    self.held = self.lookout.claim(t, ways, here, self.own[self.p.heads, 1], self.journal, asking)
-    come = []
-    for i in self.service.due(t):
-        self.service.enters(i, t, 35.0, self.journal)
-        self.own[self.p.consists.first[i] : self.p.consists.first[i + 1], 1] = 35.0
-        come.append((i, 35.0))
-    return come
+
+def _let_in(self, t, ways, here, speed, s, due):
+    """Everybody comes at his time, whoever has the track."""
+    s, held = self._claim(t, ways, here, speed, np.zeros(len(speed), bool), s)
+    come = tuple((i, 35.0) for i in due)
+    came = s.came.copy()
+    for i, v in come:
+        came[i], speed[i] = True, v
+        self.journal.event(t, "depart", train=self.p.scenario.ids[i], planned_s=t, delay_s=0.0, speed_mps=v)
+    return s._replace(came=came), held, come, {}
 
 
 def test_the_baseline_fails_too(tmp_path, typed):

@@ -5,8 +5,10 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import nets
 import numpy as np
 import pytest
+import tomli_w
 
 import trainctl
 from trainctl.errors import InputError, SimulatorError
@@ -84,9 +86,63 @@ def test_trains_obey_a_command_from_outside_until_released():
                 sim.command(wrong)
 
 
+@pytest.fixture(scope="module")
+def convoy(tmp_path_factory):
+    """Trains of two branches that join: of each a first one, which couple."""
+    folder = tmp_path_factory.mktemp("convoy")
+    nets.branches(folder, number=1)
+    (folder / "s.toml").write_text(tomli_w.dumps(nets.scenario("robust_constrained", 400)))
+    return folder / "s.toml"
+
+
+def test_a_train_in_no_formation_obeys_as_well(convoy):
+    with trainctl.Simulation.open(convoy, backend="numeric") as sim:
+        sim.step(20)
+        i = sim.trains.index("w.0")
+        assert sim.links.empty and sim.speed_mps[i] == 35.0
+        sim.command({"w.0": -0.3})
+        sim.step(10)
+        assert sim.speed_mps[i] == pytest.approx(32.0)
+        sim.release("w.0")
+        sim.step(20)
+        assert sim.speed_mps[i] > 33.0
+
+
+def test_a_train_in_a_formation_obeys_as_well(convoy):
+    with trainctl.Simulation.open(convoy, backend="numeric") as sim:
+        while sim.links.empty:
+            sim.step()
+        sim.step(5)
+        front, rear = (sim.trains.index(name) for name in ("w.0", "s.0"))
+        before = sim.speed_mps
+        sim.command({"s.0": -0.05})
+        sim.step(4)
+        assert sim.speed_mps[rear] == pytest.approx(before[rear] - 0.2)
+        assert sim.speed_mps[front] != pytest.approx(before[front] - 0.2)
+
+
+def test_every_train_has_the_reference_it_follows(convoy):
+    with trainctl.Simulation.open(convoy, backend="numeric") as sim:
+        with pytest.raises(InputError, match=r"reference_of"):
+            _ = sim.reference
+        sim.step(20)
+        for k, name in enumerate(sim.trains):  # alone: itself
+            assert sim.reference_of(name) == (sim.position_m[k], sim.speed_mps[k])
+        while sim.links.empty:
+            sim.step()
+        sim.step(120)
+        front, rear = (sim.trains.index(name) for name in ("w.0", "s.0"))
+        x, v = sim.reference_of("w.0")
+        assert x == pytest.approx(sim.position_m[front], abs=5.0) and v == pytest.approx(sim.speed_mps[front], abs=0.1)
+        behind, same = sim.reference_of("s.0")
+        assert same == v and behind - sim.position_m[rear] == pytest.approx(1200.0, abs=5.0)  # its slot, along its own way
+        with pytest.raises(InputError, match="no such train"):
+            sim.reference_of("nobody")
+
+
 def test_what_can_be_read_agrees():
     with trainctl.Simulation.open("three_tracks", backend="numeric", **SHORT) as sim:
-        assert sim.reference == (24400.0, 80.0)
+        assert sim.reference == sim.reference_of("5") == (24400.0, 80.0)
         sim.step(8)
         links, x = sim.links, dict(zip(sim.trains, sim.position_m, strict=True))
         row = links[(links["sender"] == "1") & (links["receiver"] == "2")].iloc[0]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections import deque
 from contextlib import closing
 from pathlib import Path
 
@@ -14,15 +13,14 @@ import pytest
 import tomli_w
 
 from trainctl.errors import InputError
-from trainctl.loop import Simulation
+from trainctl.loop import Loop
 from trainctl.numeric import Numeric
 from trainctl.record import checkpoint
-from trainctl.record.checkpoint import Saved, Tape, leaves, refill
+from trainctl.record.checkpoint import Saved, Tape, leaves, plain
 from trainctl.record.folder import claim, free, held, ours, remove, write_info
-from trainctl.runner import again, begin, opened
+from trainctl.runner import again, begin
 from trainctl.scenario.build import open_scenario
 from trainctl.signals import Demand, Start
-from trainctl.stages.record import Journal
 
 
 class Deaf(Numeric):
@@ -92,16 +90,20 @@ def test_a_spoiled_tape_is_refused(line, tmp_path, spoil):
         Tape(Deaf(line), tmp_path, Saved({"tape": saved}, {}))
 
 
-def test_arrays_in_tuples_are_found_and_refilled_in_place():
+def test_what_is_in_tuples_is_found_and_put_back():
     demand = Demand(np.arange(3.0), np.zeros(3, bool))
-    whole = (demand, 4.0, (np.ones(2),), "word")
-    found = dict(leaves("x", whole))
+    whole = (demand, 4.0, (np.ones(2),), "word", (7, 8))
+    found, values = dict(leaves("x", whole)), dict(plain("x", whole))
     assert sorted(found) == ["x.0.0", "x.0.1", "x.2.0"]
     saved = {name: array + 1 for name, array in found.items()}
-    refill("x", whole, saved)
-    assert demand.acceleration.tolist() == [1.0, 2.0, 3.0]
+    fresh = (Demand(np.zeros(3), np.ones(3, bool)), 0.0, (np.zeros(2),), "", ())
+    put = checkpoint.again("x", fresh, saved, json.loads(json.dumps(values)))
+    assert put[0].acceleration.tolist() == [1.0, 2.0, 3.0] and type(put[0]) is Demand
+    assert (put[1], put[3], put[4]) == (4.0, "word", (7, 8))
+    assert put[2][0].tolist() == [2.0, 2.0] and put[2][0] is not saved["x.2.0"]
+    del saved["x.2.0"]
     with pytest.raises(InputError, match=r"x\.2\.0"):
-        refill("x", whole, {**saved, "x.2.0": np.ones(3)})
+        checkpoint.again("x", fresh, saved, values)
 
 
 def test_a_file_is_replaced_whole(tmp_path):
@@ -112,54 +114,24 @@ def test_a_file_is_replaced_whole(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
-def test_every_array_of_the_loop_is_in_a_checkpoint(tmp_path):
-    """Whoever adds an array to the loop or to the motion of units has to say whether it changes."""
-    fixed = {"p", "line_track", "gradient", "breaks", "masses", "plant", "signals", "parts", "lag"}
-    fixed |= {"orders"}  # written anew in every step before they are read
-    prepared = open_scenario("fault_tolerant_noise", {"run.duration_s": 3})
-    with opened(prepared, tmp_path / "run", "numeric") as simulation:
-        simulation.step()
-        values, arrays = checkpoint.state(simulation)
-        simulation.run()
-        known = {
-            "own",
-            "track",
-            "formation",
-            "ahead",
-            "links",
-            "demand",
-            "relinked",
-            "constants",
-            "estimate",
-            "extremes",
-            "work",
-            "air",
-            "loop",
-            "heard",
-            "ever",
-            "outside",
-        }
-        for thing in (simulation, simulation.motion, simulation.exchange):
-            found = {name for name, value in vars(thing).items() if list(leaves("x", value))}
-            assert found - known - fixed == set()
-        assert {"alarms", "sent", "heard", "ever", "seen"} <= arrays.keys()
-        assert json.loads(json.dumps(values)) == values
+class Unheard:
+    """A journal nobody reads."""
+
+    def event(self, time, kind, **fields):
+        pass
+
+    def write(self, row):
+        pass
 
 
-def test_every_array_of_trains_that_come_and_go_is_in_a_checkpoint(tmp_path):
-    """Whoever adds an array to the service has to say whether it changes."""
-    with opened(open_scenario("merging", {"run.duration_s": 3}), tmp_path / "run", "numeric") as simulation:
-        simulation.run()
-        service = simulation.service
-        kept = {id(array) for _, array in leaves("x", checkpoint.state(simulation)[1]["service"])}
-        lost = {name for name, value in vars(service).items() if any(id(array) not in kept for _, array in leaves("x", value))}
-        assert lost == {"roster", "cruise", "assumed"}  # as they were read
-        lookout = {name for name, value in vars(simulation.lookout).items() if list(leaves("x", value))}
-        assert lookout == {"net", "length", "factor", "ways", "zones", "waits_for", "assumed", "rate"}
+#: The scenario, where everything is told, and what only the user sets.
+OUTSIDE = {"p", "world", "journal", "between"}
 
-
-#: Data that does not change; what is outside; functions; written anew in every step before it is read; made of the world's ways.
-NOT_STATE = {"p", "world", "journal", "between", "parts", "stops", "held", "ways", "zones"}
+#: What a stage may overwrite: written anew in every step before it is read, or made of the world's ways.
+WORK_SPACE = {
+    "plant": {"parts", "told", "orders", "plant", "constants"},
+    "traffic": {"ways", "zones"},
+}  # fmt: skip
 
 
 def remembered(name, thing):
@@ -172,14 +144,26 @@ def remembered(name, thing):
         yield f"{name}, keys", str(sorted(thing, key=str))
         for key, value in thing.items():
             yield from remembered(f"{name}[{key}]", value)
-    elif isinstance(thing, tuple | list | deque):
+    elif isinstance(thing, tuple | list):
         yield f"{name}, length", len(thing)
-        for k, value in enumerate(thing):
-            yield from remembered(f"{name}[{k}]", value)
+        for key, value in zip(getattr(thing, "_fields", range(len(thing))), thing, strict=True):
+            yield from remembered(f"{name}.{key}", value)
     elif type(thing).__module__.startswith("trainctl.") and hasattr(thing, "__dict__"):
         for key, value in vars(thing).items():
-            if key not in NOT_STATE:
+            if key not in OUTSIDE:
                 yield from remembered(f"{name}.{key}", value)
+
+
+def beside(loop):
+    """What the parts of a loop hold that is no work space, and the scenario's arrays: all but the loop's state."""
+    found = dict(remembered("p", (loop.p.own, loop.p.consists, loop.p.bounds, loop.p.reference, loop.p.first_links)))
+    for stage, thing in vars(loop).items():
+        if stage in OUTSIDE | {"state"}:
+            continue
+        for key, part in vars(thing).items() if hasattr(thing, "__dict__") else [("", thing)]:
+            if key not in OUTSIDE | WORK_SPACE.get(stage, set()):
+                found |= dict(remembered(f"{stage}.{key}", part))
+    return found
 
 
 def same(one, two):
@@ -202,32 +186,33 @@ BUSY = {
 
 #: What must have changed since the start, or nothing would be seen of it.
 CHANGED = {
-    "units": ("acting", "outside", "heard", "extremes", "alarms.count"),
-    "actuators": ("air[3]", "counted", "estimate", "exchange.sent"),
-    "points": ("pending", "ever", "formation", "exchange.sent"),
+    "units": ("watch.acting", "commanded", "messages.heard", "plant.extremes", "alarms.tally", "demand"),
+    "actuators": ("plant.sent_at", "plant.counted", "plant.heard", "plant.estimate", "messages.sent"),
+    "points": ("pending", "messages.ever", "rule.track", "formed.formation", "messages.sent"),
     "formations, stops": (
-        "claims", "came", "left", "next_stop", "stands_until", "stopping", "stops_soon", "halted", "ask_at", "parted", "refused",
-        "slot", "offset", "service.pace[2]",
+        "claims", "came", "left", "next_stop", "stands_until", "stopping", "rule.slot", "ask_at", "parted", "refused",
+        "formed.ahead", "formed.led", "formed.offset", "pace.acceleration",
     ),
     "single track": ("waits_for", "claims"),
 }  # fmt: skip
 
 
 def lost(expected, found):
-    return [place for place in expected | found if not same(expected.get(place), found.get(place))]
+    both = expected.keys() & found.keys()
+    return [place for place in expected | found if place not in both or not same(expected[place], found[place])]
 
 
 def from_checkpoint(p, folder):
-    """What a simulation remembers that comes from the checkpoint in a folder."""
+    """The loop that goes on from the checkpoint in a folder."""
     saved = checkpoint.read(folder, p)
     with closing(Tape(Numeric(p.line), folder, saved)) as tape:
-        simulation = Simulation(p, tape, checkpoint.Unheard())
-        checkpoint.restore(simulation, tape, saved)
-        return dict(remembered("simulation", simulation))
+        loop = Loop(p, tape, Unheard())
+        checkpoint.restore(loop, tape, saved)
+        return loop
 
 
 @pytest.mark.parametrize("case", BUSY)
-def test_a_simulation_that_goes_on_from_a_checkpoint_remembers_all_that_one_does_which_went_on(case, tmp_path):
+def test_a_loop_that_goes_on_from_a_checkpoint_remembers_all_that_one_does_which_went_on(case, tmp_path):
     name, changes, steps = BUSY[case]
     if case == "single track":
         name = str(tmp_path / "s.toml")
@@ -235,23 +220,43 @@ def test_a_simulation_that_goes_on_from_a_checkpoint_remembers_all_that_one_does
         nets.single_track(tmp_path, up + nets.flow("down", nets.DOWN, 2, 60, 20, departSpeed="0"))
         (tmp_path / "s.toml").write_text(tomli_w.dumps(nets.scenario("robust_constrained", 900)))
     p = open_scenario(name, changes)
-    with closing(Journal(tmp_path, p)) as journal, closing(Tape(Numeric(p.line), tmp_path)) as tape:
-        went_on, changed = Simulation(p, tape, journal), set()
-        begun = dict(remembered("simulation", went_on))
+    with closing(Tape(Numeric(p.line), tmp_path)) as tape:
+        went_on, changed = Loop(p, tape, Unheard()), set()
+        begun, made = dict(remembered("state", went_on.state)), beside(went_on)
         for k in range(steps[-1]):
             if case == "units" and k == 20:
-                went_on.outside[:] = -5.0, *[5.0] * 5  # so that the supervisor has to act
+                went_on.command(slice(None), np.array([-5.0, *[5.0] * 5]))  # so that the supervisor has to act
             went_on.step()
             if went_on.k in steps:
                 place = tmp_path / str(went_on.k)
                 place.mkdir()
                 checkpoint.write(place, went_on, {**checkpoint.identity(p), "tape": tape.save()})
                 shutil.copy(tmp_path / "moves.bin", place)
-                expected = dict(remembered("simulation", went_on))
-                assert lost(expected, from_checkpoint(p, place)) == []
+                expected = dict(remembered("state", went_on.state))
+                assert lost(expected, dict(remembered("state", from_checkpoint(p, place).state))) == []
                 changed |= {name for name in expected if name in lost(begun, expected)}
+        assert lost(made, beside(went_on)) == [], "a stage holds what changes and is in no checkpoint"
     assert len(expected) > 60
-    assert [name for name in CHANGED.get(case, []) if not any(name in place for place in changed)] == []
+    assert [name for name in CHANGED[case] if not any(name in place for place in changed)] == []
+
+
+def test_a_stage_that_keeps_something_to_itself_is_found_out():
+    p = open_scenario("three_tracks")
+    loop = Loop(p, Numeric(p.line), Unheard())
+    made = beside(loop)
+    assert {"control.clamps", "orders.theta", "record.track_of", "protect.disturbing"} <= made.keys()
+    for stage, thing in (("control", 3), ("driver", [1.0]), ("protect", {"x": np.zeros(2)}), ("record", None)):
+        getattr(loop, stage).hidden = thing
+        assert any(place.startswith(f"{stage}.hidden") for place in lost(made, beside(loop))), stage
+
+
+def test_what_is_no_array_in_a_state_is_plain_json():
+    p = open_scenario("merging")
+    loop = Loop(p, Numeric(p.line), Unheard())
+    for _ in range(3):
+        loop.step()
+    values = dict(plain("state", loop.state))
+    assert json.loads(json.dumps(values)) == values and values["state.0"] == 3
 
 
 @pytest.mark.parametrize("own_line", [False, True])

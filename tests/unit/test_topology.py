@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from trainctl.topology import graph
-from trainctl.topology.exchange import Exchange
+from trainctl.topology.exchange import Radio, deliver, relinked, silent
 
 IDS = tuple("123456")
 NOTHING = graph.Stated(None, None, None, None)
@@ -90,55 +90,69 @@ def test_senders_ahead_come_first_in_order():
             assert rank[sender] < rank[receiver]
 
 
-def deliveries(exchange, links, count, position=None):
-    position = np.arange(6.0) * -1000.0 if position is None else position
-    return np.array([exchange.deliver(np.full((6, 1), float(k)), position, links, k) for k in range(count)])
+def deliveries(radio, links, count):
+    """Which links heard in so many exchanges, and the messages after them; train i says k in exchange k."""
+    messages, heard, position = silent(), [], np.arange(6.0) * -1000.0
+    for k in range(count):
+        messages, now = deliver(radio, messages, np.full((6, 1), float(k)), position, links, k)
+        heard.append(now)
+    return np.array(heard), messages
 
 
 def test_losses_are_seeded_and_of_the_stated_share():
     links = made(plan(), [1] * 6)
-    first, again, other = (deliveries(Exchange(0.1, 0, np.inf, seed), links, 2000) for seed in (1, 1, 2))
+    first, again, other = (deliveries(Radio(0.1, 0, np.inf, seed), links, 2000)[0] for seed in (1, 1, 2))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
     assert 1 - first.mean() == pytest.approx(0.1, abs=0.01)
 
 
 def test_a_lost_message_leaves_the_last_one_in_place():
-    links = made(plan(), [1] * 6)
-    exchange = Exchange(0.5, 0, np.inf, 3)
-    before = None
+    links, radio = made(plan(), [1] * 6), Radio(0.5, 0, np.inf, 3)
+    messages = silent()
     for k in range(50):
-        heard = exchange.deliver(np.full((6, 1), float(k)), np.zeros(6), links, k)
-        assert np.all(exchange.heard[heard] == k)
-        if before is not None:
-            assert np.array_equal(exchange.heard[~heard], before[~heard])
-        before = exchange.heard.copy()
+        before = messages
+        messages, heard = deliver(radio, before, np.full((6, 1), float(k)), np.zeros(6), links, k)
+        assert np.all(messages.heard[heard] == k)
+        if k:
+            assert np.array_equal(messages.heard[~heard], before.heard[~heard])
+
+
+def test_an_exchange_leaves_the_messages_before_as_they_were():
+    """Whoever tries a step must find them again."""
+    links, radio = made(plan(), [1] * 6), Radio(0.5, 1, np.inf, 3)
+    messages = deliveries(radio, links, 5)[1]
+    sent, heard, ever = [s.copy() for s in messages.sent], messages.heard.copy(), messages.ever.copy()
+    later, _ = deliver(radio, messages, np.full((6, 1), 9.0), np.zeros(6), links, 5)
+    assert [s.tolist() for s in messages.sent] == [s.tolist() for s in sent]
+    assert np.array_equal(messages.heard, heard) and np.array_equal(messages.ever, ever)
+    assert not np.array_equal(later.heard, heard)
 
 
 def test_delay_counts_exchanges():
     links = made(plan(), [1] * 6)
-    exchange = Exchange(0.0, 2, np.inf, 0)
-    assert deliveries(exchange, links, 3).all(axis=1).tolist() == [False, False, True]
-    assert np.all(exchange.heard == 0.0)
+    heard, messages = deliveries(Radio(0.0, 2, np.inf, 0), links, 3)
+    assert heard.all(axis=1).tolist() == [False, False, True]
+    assert np.all(messages.heard == 0.0)
+    heard, messages = deliveries(Radio(0.0, 2, np.inf, 0), links, 8)
+    assert np.all(messages.heard == 5.0) and len(messages.sent) == 3  # what has arrived is not kept
 
 
 def test_messages_end_at_the_range():
     links = made(plan(), [1] * 6)
-    exchange = Exchange(0.0, 0, 1500.0, 0)
     position = np.array([0.0, -1000.0, -3000.0, -4000.0, -5000.0, -6000.0])
-    heard = exchange.deliver(np.zeros((6, 1)), position, links, 0)
+    _, heard = deliver(Radio(0.0, 0, 1500.0, 0), silent(), np.zeros((6, 1)), position, links, 0)
     pairs = {frozenset((int(s), int(r))) for s, r, h in zip(links.sender, links.receiver, heard, strict=True) if not h}
     assert pairs == {frozenset((1, 2))}
 
 
 def test_what_was_heard_stays_with_its_link_when_the_graph_changes():
     before, after = made(plan(), [1, 1, 1, 1, 2, 1]), made(plan(), [1, 3, 1, 1, 1, 1])
-    exchange = Exchange(0.0, 0, np.inf, 0)
-    exchange.deliver(np.arange(6.0)[:, None], np.zeros(6), before, 0)
-    exchange.relink(before, after)
+    messages, _ = deliver(Radio(0.0, 0, np.inf, 0), silent(), np.arange(6.0)[:, None], np.zeros(6), before, 0)
+    messages = relinked(messages, before, after)
     heard = {
         (int(s), int(r)): (v, e)
-        for s, r, v, e in zip(after.sender, after.receiver, exchange.heard[:, 0], exchange.ever, strict=True)
+        for s, r, v, e in zip(after.sender, after.receiver, messages.heard[:, 0], messages.ever, strict=True)
     }
     assert heard[2, 3] == (2.0, True)
     assert heard[0, 2][1] == np.False_
@@ -147,16 +161,16 @@ def test_what_was_heard_stays_with_its_link_when_the_graph_changes():
 def test_a_link_that_has_received_once_stays_one_whatever_is_lost_and_however_the_graph_changes():
     """A train that goes by old messages must not take the zeros of a new link for one."""
     before, after = made(plan(), [1, 1, 1, 1, 2, 1]), made(plan(), [1, 3, 1, 1, 1, 1])
-    exchange = Exchange(0.5, 0, np.inf, 3)
+    messages, radio = silent(), Radio(0.5, 0, np.inf, 3)
     received, last = np.zeros(len(before.sender), bool), np.zeros(len(before.sender))
     for k in range(1, 3):
-        heard = exchange.deliver(10.0 * k + np.arange(6.0)[:, None], np.zeros(6), before, k)
+        messages, heard = deliver(radio, messages, 10.0 * k + np.arange(6.0)[:, None], np.zeros(6), before, k)
         received |= heard
         last[heard] = 10.0 * k + before.sender[heard]
-        np.testing.assert_array_equal(exchange.ever, received)
+        np.testing.assert_array_equal(messages.ever, received)
     assert (received & ~heard).any() and not received.all()  # some were lost again, some never heard
-    exchange.relink(before, after)
+    messages = relinked(messages, before, after)
     old = {(s, r): (e, x) for s, r, e, x in zip(before.sender, before.receiver, received, last, strict=True)}
     kept = [old.get((s, r), (False, 0.0)) for s, r in zip(after.sender, after.receiver, strict=True)]
-    assert list(zip(exchange.ever.tolist(), exchange.heard[:, 0].tolist(), strict=True)) == kept
+    assert list(zip(messages.ever.tolist(), messages.heard[:, 0].tolist(), strict=True)) == kept
     assert any(e for e, _ in kept) and not all((s, r) in old for s, r in zip(after.sender, after.receiver, strict=True))

@@ -73,7 +73,7 @@ class Control:
         messages, heard = exchange.deliver(self.radio, messages, sent, trains.position, formed.links, number)
         links = formed.links._replace(heard=heard)
         if p.remembers:
-            if memory == ():
+            if k == 0:
                 memory = law.initial(p.params, p.scene(own, formed.links, t))
             demand, memory = law.demand(formed.constants, trains, leader, links, messages.heard, memory)
         else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -84,16 +85,18 @@ class Traffic:
             stands_until=np.full(n, np.nan), stopping=np.zeros(n, bool), waits_for=np.full(n, -1), claims=interlocking.none(),
         )  # fmt: skip
 
-    def step(self, t: float, ways: Ways, seen: Seen, speed: Floats, overrun: Floats, s: State) -> tuple[State, Around]:
+    def step(
+        self, t: float, ways: Ways, seen: Seen, speed: Floats, overrun: Floats, s: State, last: bool = False
+    ) -> tuple[State, Around]:
         """Arrivals, stops, entries; ``overrun`` (n,) is how much farther trains run than their brakes promise [m].
 
-        ``speed`` (n,) gets the speeds of trains that enter.
+        ``speed`` (n,) gets the speeds of trains that enter; at the ``last`` instant of a run nobody does.
         """
         s = self.arrivals(t, seen, s)
         if not self.looks:
             return s, nothing(len(speed))
         s, stops, soon = self._stops(t, seen, speed, overrun, s)
-        s, held, entries, kept_out = self.entering(t, ways, seen, speed, s)
+        s, held, entries, kept_out = self.entering(t, ways, seen, speed, s, [] if last else self.due(t, s))
         present = seen.present.copy()
         present[[i for i, _ in entries]] = True
         view = self._look(ways, seen._replace(present=present), speed, held, s)
@@ -125,10 +128,9 @@ class Traffic:
         return [self.p.scenario.ids[i] for i in late]
 
     def entering(
-        self, t: float, ways: Ways, here: Seen, speed: Floats, s: State
+        self, t: float, ways: Ways, here: Seen, speed: Floats, s: State, due: Sequence[int]
     ) -> tuple[State, Held, tuple[tuple[int, float], ...], dict[int, int]]:
-        """Trains whose time has come and whose place is clear, with the speed they come with [m/s]; who keeps out the others."""
-        due = self.due(t, s)
+        """Trains of those that are ``due`` whose place is clear, with the speed they come with [m/s]; who keeps out the others."""
         asking = np.zeros(len(speed), bool)
         asking[due] = True
         s, held = self._claim(t, ways, here, speed, asking, s)
