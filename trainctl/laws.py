@@ -132,10 +132,19 @@ def find_observer(name: str) -> Any:
 
 def find_plant(name: str) -> Any:
     """The module of a plant; other modules of the folder are not one."""
-    known = [m.name for m in pkgutil.iter_modules(plants.__path__) if hasattr(_module(plants, m.name), "relied_on")]
+    known = _plants()
     if name not in known:
         raise InputError(f"plant.kind = {name}: no such plant; known: {', '.join(known)}")
     return _module(plants, name)
+
+
+def _plants() -> list[str]:
+    return [m.name for m in pkgutil.iter_modules(plants.__path__) if hasattr(_module(plants, m.name), "relied_on")]
+
+
+def moves_points(name: str) -> bool:
+    """Whether a plant moves trains as points; of one that does not exist nothing is said here."""
+    return name in _plants() and not find_plant(name).UNITS
 
 
 def plants_of(law: Any) -> tuple[str, ...]:

@@ -301,8 +301,6 @@ def prepare(
     plan = attempt(_plan, scenario)
     misplaced = placing.on_the_line(scenario, network[0]) if network is not None and trains is None else []
     found += misplaced
-    if plant is not None and not plant.UNITS:
-        found += _many_units(scenario)
     if plant is None or any(part is None for part in (law, params, observer, observer_params, plant_params, plan)):
         raise InputError([f"{file}: {line}" for line in found])
 
@@ -452,15 +450,6 @@ def _initial(scenario: Scenario, plant: Plant, consists: Consists) -> Floats:
         own[a:b, POSITION] = t.position_m - back
         own[a:b, SPEED] = t.speed_mps if t.unit_speed_mps is None else t.unit_speed_mps
     return plant.balanced(own, consists)
-
-
-def _many_units(scenario: Scenario) -> list[str]:
-    """Types of trains that are no points."""
-    types = scenario.train_type
-    many = sorted({t.type for t in scenario.train if t.type in types and types[t.type].units > 1})
-    return [
-        f"train_type.{name}.units = {types[name].units}: the {scenario.plant.kind} plant has one unit per train" for name in many
-    ]
 
 
 def _bounds(scenario: Scenario, plant: Plant, consists: Consists) -> Bounds:

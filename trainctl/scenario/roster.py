@@ -200,6 +200,8 @@ def _types(scenario: Scenario, traffic: Traffic) -> tuple[dict[str, TrainType], 
                 found += kind
             else:
                 types[name] = kind
+        else:
+            found += scenario.plant.too_many(name, types[name])
     return types, found
 
 

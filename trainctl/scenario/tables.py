@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
+from trainctl.laws import moves_points
 from trainctl.plants.disturbance import Disturbance
 from trainctl.plants.faults import Fault
 from trainctl.railway.supervisor import Params as Supervisor
@@ -314,6 +315,12 @@ class Plant(Module):
 
     kind: str = Field("point", description="Module in trainctl.plants.")
 
+    def too_many(self, name: str, of: TrainType) -> list[str]:
+        """What is wrong with trains of several units on a plant of points."""
+        if of.units == 1 or not moves_points(self.kind):
+            return []
+        return [f"train_type.{name}.units = {of.units}: the {self.kind} plant has one unit per train"]
+
 
 class Scenario(Table):
     """A whole scenario file."""
@@ -376,6 +383,8 @@ class Scenario(Table):
                 found.append(f"event[{k}].train = {event.train}: no such train; there are: {', '.join(ids)}")
         if self.topology.loss > 0 and self.run.seed is None:
             found.append(f"topology.loss = {self.topology.loss:g}: losses are random, so the run needs [run] seed")
+        for name in sorted({t.type for t in self.train if t.type in types}):
+            found += self.plant.too_many(name, types[name])
         return found
 
     def _of_the_network(self, resolved: bool) -> list[str]:
