@@ -270,11 +270,16 @@ class Observer(Protocol):
     def initial(self, params: Any, own: Floats) -> Floats:
         """Estimates at the start, shape (U, width)."""
 
-    def correction(self, i: int, constants: Any, own: Floats, estimate: Floats, out: Floats) -> None:
-        """Write the corrections of train ``i``, which the law may read, into ``out`` (units, CORRECTIONS)."""
+    def correction(self, i: int, constants: Any, own: Floats, estimate: Floats, held: Bools, out: Floats) -> None:
+        """Write the corrections of train ``i``, which the law may read, into ``out`` (units, CORRECTIONS).
 
-    def rate(self, i: int, constants: Any, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats) -> None:
-        """Write d(estimate)/dt into ``out``; ``applied`` [N] is what the limits left of the demand."""
+        ``held`` (units,) are units the plant holds at standstill: they stay, whatever forces act on them.
+        """
+
+    def rate(
+        self, i: int, constants: Any, own: Floats, estimate: Floats, held: Bools, correction: Floats, applied: Floats, out: Floats
+    ) -> None:
+        """Write d(estimate)/dt into ``out``; ``applied`` [N] is what the limits left of the demand, ``held`` as above."""
 
     def fault_estimate(self, constants: Any, estimate: Floats) -> Floats:
         """What it takes the faults for [m/s3], (U,), for logs; NaN where it estimates none."""

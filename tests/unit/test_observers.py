@@ -41,10 +41,10 @@ def plant_rate(constants, own, applied, t=0.0):
     return out
 
 
-def observed(observer, constants, own, estimate, applied):
+def observed(observer, constants, own, estimate, applied, held=np.zeros(3, bool)):
     correction, out = np.zeros((len(own), observer.CORRECTIONS)), np.zeros_like(estimate)
-    observer.correction(0, constants, own, estimate, correction)
-    observer.rate(0, constants, own, estimate, correction, applied, out)
+    observer.correction(0, constants, own, estimate, held, correction)
+    observer.rate(0, constants, own, estimate, held, correction, applied, out)
     return correction, out
 
 

@@ -19,7 +19,9 @@ p              the observer's pole, n times
 Departures from [1]_
 --------------------
 * (17) prints D1 without ``-r v``. Its derivative must be B1, which contains ``-r``: without it the observer is unstable.
-* At standstill the resistance is zero, as in the plant.
+* At standstill the resistance is zero, as in the plant, and a unit that the plant holds there is known to stand: its estimates
+  settle on that with ``SETTLE``, its fault states go on as (3) says, uncorrected. What the law reads is the motion it would have if
+  it were let go from there. Uncorrected measurements of a unit that does not follow its forces would wind the estimates up.
 
 References
 ----------
@@ -38,7 +40,7 @@ from pydantic import Field
 
 from trainctl.davis import running_resistance
 from trainctl.kernels import inlined
-from trainctl.signals import POSITION, SPEED, Consists, Floats, Ints, Observer, Scene, Table
+from trainctl.signals import POSITION, SPEED, Bools, Consists, Floats, Ints, Observer, Scene, Table
 
 if TYPE_CHECKING:
     from trainctl.observers import asymptotic
@@ -54,6 +56,10 @@ X, V, W, F = 0, 1, 2, 3
 #: Columns of ``correction``: hat x', hat v', hat w' without the input, the part of the last one that the law leaves alone [m/s3],
 #: and the force of (5) at u = 0 [N].
 X_RATE, V_RATE, W_DRIFT, UNCOMPENSATED, STATIC = 0, 1, 2, 3, 4
+
+
+#: How fast estimates of a unit that is held settle on standstill [1/s].
+SETTLE = 20.0
 
 
 class Params(Table):
@@ -213,7 +219,7 @@ def initial(params: Params, own: Floats) -> Floats:
 
 
 @inlined()
-def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out: Floats) -> None:
+def correction(i: int, constants: Constants, own: Floats, estimate: Floats, held: Bools, out: Floats) -> None:
     """Right-hand sides of (13) with the corrections (14), without the input; then the force of (5) at u = 0."""
     c, m = constants, constants.train
     first, last = m.first[i], len(own) - 1
@@ -228,14 +234,16 @@ def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out:
         if j < last:
             mu2 -= unit[REAR] * (estimate[j + 1, V] - own[j + 1, SPEED])
         out[j, X_RATE] = v - c.k1 * (estimate[j, X] - own[j, POSITION])
-        out[j, V_RATE] = estimate[j, W] + mu2
+        out[j, V_RATE] = -SETTLE * ev if held[j] else estimate[j, W] + mu2
     for j in range(last + 1):  # mu3 and the model; the B1(v) w_hat of (13) and the three terms with B1 in mu3 add up to this
         unit = m.units[first + j]
-        drift = own_coefficient(unit, estimate[j, V]) * out[j, V_RATE] + c.k3 * (estimate[j, V] - own[j, SPEED])
-        if j > 0:
-            drift += unit[FRONT] * out[j - 1, V_RATE]
-        if j < last:
-            drift += unit[REAR] * out[j + 1, V_RATE]
+        drift = 0.0
+        if not held[j]:
+            drift = own_coefficient(unit, estimate[j, V]) * out[j, V_RATE] + c.k3 * (estimate[j, V] - own[j, SPEED])
+            if j > 0:
+                drift += unit[FRONT] * out[j - 1, V_RATE]
+            if j < last:
+                drift += unit[REAR] * out[j + 1, V_RATE]
         fault = 0.0
         for q in range(c.C.shape[1]):
             fault += c.C[first + j, q] * estimate[j, F + q]
@@ -245,7 +253,9 @@ def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out:
 
 
 @inlined()
-def rate(i: int, constants: Constants, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats) -> None:
+def rate(
+    i: int, constants: Constants, own: Floats, estimate: Floats, held: Bools, correction: Floats, applied: Floats, out: Floats
+) -> None:
     """d(estimate)/dt of (13); the input is what was applied after the limits."""
     c, m = constants, constants.train
     for j in range(len(own)):
@@ -255,6 +265,8 @@ def rate(i: int, constants: Constants, own: Floats, estimate: Floats, correction
         out[j, V] = correction[j, V_RATE]
         out[j, W] = correction[j, W_DRIFT] + unit[RATE] / unit[MASS] * (applied[j] - correction[j, STATIC])
         ev = estimate[j, V] - own[j, SPEED]
+        if held[j]:
+            out[j, W], ev = -SETTLE * estimate[j, W], 0.0
         out[j, F] = c.k4[u, 0] * ev
         for q in range(len(c.omega)):
             sine, cosine = F + 1 + 2 * q, F + 2 + 2 * q
@@ -293,6 +305,6 @@ def static_force(i: int, train: Train, own: Floats, out: Floats) -> None:
             dv = v - own[j + 1, SPEED]
             rear = unit[STIFFNESS] * (own[j, POSITION] - own[j + 1, POSITION] - unit[LENGTH]) + unit[DAMPING] * dv
             rear_closing = unit[STIFFNESS] * dv
-        resistance = running_resistance(v, unit[C0], unit[C1], unit[C2])
+        resistance = running_resistance(v, unit[C0], unit[C1], unit[C2]) if v > 0.0 else unit[C0]  # that of moving off
         out[j, STATIC] = rear - stretched + unit[MASS] * resistance + (rear_closing - closing) / unit[RATE]
         stretched, closing = rear, rear_closing

@@ -224,7 +224,7 @@ def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, app
 
     Notes
     -----
-    Departs from the paper: at standstill resistance is zero and a unit is held unless what acts on it drives it forward.
+    Departs from the paper: a unit that stands is held unless what acts on it overcomes the resistance of slow motion, c0.
     """
     a, last = constants.first[i], len(applied) - 1
     traction = braking = resistance = damping = climb = disturbance = 0.0
@@ -243,7 +243,9 @@ def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, app
         acceleration = (tau + pull - rear - drag - weight + push) / unit[INERTIA]
         fault = fault_rate(constants.faults, a + j, t, inside) + unit[INERTIA] * unit[NOISE]
         out[j, POSITION] = v
-        out[j, SPEED] = acceleration if v > 0.0 else max(acceleration, -HOLD * v)
+        if v <= 0.0:  # whoever moves off meets the resistance of motion: without it a unit would start and stop for ever
+            acceleration = max(acceleration - unit[MASS] * unit[C0] / unit[INERTIA], -HOLD * v)
+        out[j, SPEED] = acceleration
         out[j, FORCE] = unit[RATE] * (effectiveness(constants.faults, a + j, inside) * applied[j] - tau) + fault
         traction += max(tau * v, 0.0)
         braking += max(-tau * v, 0.0)
