@@ -249,4 +249,3 @@ class Loop(Steps):
         said += ["limited by its plant"] if motion.limited[i] else []
         said += ["its law saturated"] if demand.saturated[i] else []
         return f"train {self.p.scenario.ids[i]} was {', '.join(said)}" if said else ""
-

@@ -340,9 +340,10 @@ class PointPlant(Plant, Protocol):
     """Trains as points, moved from step to step by an exact map: see ``plants.point`` for ``Kick`` and ``Moved``."""
 
     def constants(
-        self, params: Any, consists: Consists, resistance_factor: Floats | None = None, gradient: Floats | None = None
-    ) -> Any:
-        """Arrays of all trains; those of ``plants.point.Constants`` are among them."""
+        self, params: Any, consists: Consists, resistance_factor: Floats | None = None, gradient: Floats | None = None,
+        clamps: Bounds | None = None,
+    ) -> Any:  # fmt: skip
+        """Arrays of all trains; those of ``plants.point.Constants`` are among them, and what clamps each train."""
 
     def advance(self, constants: Any, own: Floats, acceleration: Floats, step: float, kick: Any) -> Any:
         """One step of all trains that are asked for ``acceleration`` (n,)."""

@@ -41,7 +41,10 @@ def plant_rate(constants, own, applied, t=0.0):
     return out
 
 
-def observed(observer, constants, own, estimate, applied, held=np.zeros(3, bool)):
+FREE = np.zeros(3, bool)
+
+
+def observed(observer, constants, own, estimate, applied, held=FREE):
     correction, out = np.zeros((len(own), observer.CORRECTIONS)), np.zeros_like(estimate)
     observer.correction(0, constants, own, estimate, held, correction)
     observer.rate(0, constants, own, estimate, held, correction, applied, out)

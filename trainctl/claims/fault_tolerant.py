@@ -109,7 +109,7 @@ class Example:
         for k in range(round(duration / chunk)):
             t = k * chunk
             if self.seed is not None:
-                moving.units[:, plant.NOISE] = plant.noise(NOISY, self.seed, round(t / NOISY.noise_hold_s), 9)
+                plant.make_noise(NOISY, moving, self.seed, round(t / NOISY.noise_hold_s))
             if self.period and k % round(self.period / chunk) == 0:  # nothing has been heard yet at the start: the exact chain
                 integrate.exchange(
                     parts, loop, c.first, s.links, s.reference, air._replace(live=k == 0), t, own, estimate, work

@@ -101,9 +101,9 @@ def scratch(own: Floats, estimate: Floats, trains: int, corrections: int, messag
     """Work space for these shapes."""
     units = len(own)
     return Scratch(
-        np.zeros(4), np.zeros(units, bool), np.zeros((units, corrections)), np.zeros(units), np.zeros_like(own), np.zeros_like(estimate),
-        np.zeros((trains, len(POWERS))), np.zeros((trains, message)), np.zeros(trains), np.zeros_like(own), np.zeros_like(own),
-        np.zeros_like(estimate), np.zeros_like(estimate), np.zeros(units),
+        np.zeros(4), np.zeros(units, bool), np.zeros((units, corrections)), np.zeros(units), np.zeros_like(own),
+        np.zeros_like(estimate), np.zeros((trains, len(POWERS))), np.zeros((trains, message)), np.zeros(trains), np.zeros_like(own),
+        np.zeros_like(own), np.zeros_like(estimate), np.zeros_like(estimate), np.zeros(units),
     )  # fmt: skip
 
 

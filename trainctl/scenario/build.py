@@ -15,13 +15,14 @@ from pydantic import ValidationError
 
 import sumo_net
 from sumo_net import Line, LineError, Rails
+from trainctl import draws
 from trainctl.davis import resistance
 from trainctl.errors import InputError
 from trainctl.laws import find_law, find_observer, find_plant, unfit
 from trainctl.plants import disturbance
 from trainctl.railway import supervisor
 from trainctl.railway.authority import DRIVER_MARGIN_M
-from trainctl.scenario import placing, promise, roster
+from trainctl.scenario import limits, placing, promise, roster
 from trainctl.scenario.reading import examine, mistakes, read
 from trainctl.scenario.reference import Profile
 from trainctl.scenario.tables import Scenario, Traffic
@@ -111,7 +112,17 @@ class Prepared:
     @cached_property
     def sure_braking(self) -> Floats:
         """Deceleration every train can give on the level at any speed it may have [m/s2], shape (n,); infinite for free points."""
-        return self.plant.sure_braking(self.plant_params, self.consists, promise.top_speed(self))
+        given = self.plant.sure_braking(self.plant_params, self.consists, promise.top_speed(self))
+        return np.minimum(given, -self.clamps.input_lower)
+
+    @cached_property
+    def clamps(self) -> Bounds:
+        """Where the plant itself clamps every train, infinite where it does not.
+
+        It does where [plant] says so, and for a law whose model clamps: then at the train's bounds, the tightest of what is said.
+        """
+        everywhere = getattr(self.law, "CLAMPED", False)
+        return limits.clamps(everywhere, self.plant, self.plant_params, self.bounds)
 
     @cached_property
     def assumed(self) -> supervisor.Assumed:
@@ -173,7 +184,8 @@ class Prepared:
         """How messages travel."""
         run, top = self.scenario.run, self.scenario.topology
         period = top.communication_period_s or run.control_period_s or run.step_s
-        return Radio(top.loss, round(top.delay_s / period), top.range_m or np.inf, run.seed or 0)
+        names = np.array([draws.word(name) for name in self.scenario.ids], np.int64)
+        return Radio(top.loss, round(top.delay_s / period), top.range_m or np.inf, run.seed or 0, names)
 
     @property
     def spacing(self) -> convoys.Spacing:
@@ -305,7 +317,7 @@ def prepare(
         raise InputError([f"{file}: {line}" for line in found])
 
     consists = scenario.consists()
-    bounds = _bounds(scenario, plant, consists)
+    bounds = limits.of_trains(scenario, plant, plant_params, consists)
     # Trains that come and go are checked as the one formation they could be.
     placed = scenario if trains is None else roster.in_formation(scenario, plan.slot)
     own = _initial(placed, plant, consists)
@@ -317,7 +329,7 @@ def prepare(
     reference = scenario.reference.leader(start)
     first = graph.links(plan, graph.order_on_tracks(own[consists.first[:-1], POSITION], track), track)
     prepared = Prepared(
-        scenario=_resolved(scenario, bounds), file=file, law=law, params=params, plant=plant, plant_params=plant_params,
+        scenario=limits.resolved(scenario, bounds), file=file, law=law, params=params, plant=plant, plant_params=plant_params,
         observer=observer, observer_params=observer_params, consists=consists, own=own, bounds=bounds, reference=reference,
         plan=plan, first_links=first, line=None, spec=None, net=None, roster=None,
     )  # fmt: skip
@@ -452,43 +464,6 @@ def _initial(scenario: Scenario, plant: Plant, consists: Consists) -> Floats:
     return plant.balanced(own, consists)
 
 
-def _bounds(scenario: Scenario, plant: Plant, consists: Consists) -> Bounds:
-    """The scenario's bounds; where it states no input bounds, what the units can always give within the speed band."""
-    bounds = scenario.bounds_of_trains()
-    least, greatest = _room(scenario, plant, consists)
-    return bounds._replace(
-        input_lower=np.where(np.isfinite(bounds.input_lower), bounds.input_lower, least),
-        input_upper=np.where(np.isfinite(bounds.input_upper), bounds.input_upper, greatest),
-    )
-
-
-def _room(scenario: Scenario, plant: Plant, consists: Consists) -> tuple[Floats, Floats]:
-    """Input the trains can give anywhere in the speed band, infinite where there is no band."""
-    bounds = scenario.bounds_of_trains()
-    n = len(scenario.train)
-    if not np.all(np.isfinite(bounds.speed_lower) & np.isfinite(bounds.speed_upper)):
-        return np.full(n, -np.inf), np.full(n, np.inf)
-    return plant.room(consists, bounds.speed_lower, bounds.speed_upper)
-
-
-def _resolved(scenario: Scenario, bounds: Bounds) -> Scenario:
-    """The scenario as it is logged: with the input bounds that follow from the units, and a law's file by its name alone."""
-    law = scenario.controller.law
-    if law.endswith(".py"):  # a copy of it stands beside the scenario
-        scenario = scenario.model_copy(update={"controller": scenario.controller.model_copy(update={"law": Path(law).name})})
-    if not np.all(np.isfinite(bounds.input_lower) & np.isfinite(bounds.input_upper)):
-        return scenario
-    low, high = bounds.input_lower.tolist(), bounds.input_upper.tolist()
-    if len(set(low)) == len(set(high)) == 1:
-        table = scenario.bounds.model_copy(update={"input_lower_mps2": low[0], "input_upper_mps2": high[0]})
-        return scenario.model_copy(update={"bounds": table})
-    own = [
-        t.model_copy(update={"input_lower_mps2": a, "input_upper_mps2": b})
-        for t, a, b in zip(scenario.train, low, high, strict=True)
-    ]
-    return scenario.model_copy(update={"train": tuple(own)})
-
-
 def _fits(p: Prepared) -> list[str]:
     """Law, plant and observer that do not go together, bounds no train can keep, a line that is too short."""
     found = (
@@ -501,16 +476,11 @@ def _fits(p: Prepared) -> list[str]:
         ):
             if not low < high:
                 found.append(f"train[{t.id}]: {key} bounds {low:g} .. {high:g} are empty")
-    if getattr(p.law, "CLAMPED", False):
-        for key in p.plant.CLAMPS:
-            clamp, bound = getattr(p.plant_params, key), getattr(p.scenario.bounds, key)
-            if clamp != bound:
-                found.append(f"plant.{key} = {clamp}: must be [bounds] {key} = {bound}, this law's model clamps there")
     if p.self_driven:
         return found + list(p.law.unfit(p.scenario))
     found += [*_messages_fit(p), *_disturbances_fit(p)]
     if p.sampled:
-        least, greatest = _room(p.scenario, p.plant, p.consists)
+        least, greatest = limits.room(p.scenario.bounds_of_trains(), p.plant, p.consists)
         for i, t in enumerate(p.scenario.train):
             if p.bounds.input_lower[i] < least[i] - 1e-12:
                 found.append(

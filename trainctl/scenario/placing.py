@@ -142,8 +142,8 @@ def _reroute(
 ) -> tuple[str, float]:
     """Check one reroute as far as it is certain before the run; where the train is afterwards, at least."""
     train = next(t for t in scenario.train if t.id == event.train)
-    slowest = train.speed_lower_mps if train.speed_lower_mps is not None else scenario.bounds.speed_lower_mps
-    passed = max(at_least, train.position_m + max(slowest or 0.0, 0.0) * event.time_s)
+    slowest = max(v for v in (train.speed_lower_mps, scenario.bounds.speed_lower_mps, 0.0) if v is not None)
+    passed = max(at_least, train.position_m + slowest * event.time_s)
     if event.crossover is None:
         if event.to_track not in line.track_ids:
             found.append(f"{here}.to_track = {event.to_track}: no such track; there are: {', '.join(line.track_ids)}")
