@@ -14,7 +14,7 @@ NOTHING = graph.Stated(None, None, None, None)
 def plan(**more):
     fields = {
         "rule": "same_track", "equal": False, "first_slot": 0.0, "desired": np.full(5, 5000.0), "lower": np.full(5, 100.0),
-        "upper": np.full(5, 10000.0), "weight": 1.0, "stated": {}, "extra": (), "fixed": (),
+        "upper": np.full(5, 10000.0), "weight": 1.0, "stated": {}, "extra": (), "fixed": (), "place": np.arange(6),
     }  # fmt: skip
     return graph.Plan(**{**fields, **more})
 

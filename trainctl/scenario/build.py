@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -322,10 +323,11 @@ def prepare(
     placed = scenario if trains is None else roster.in_formation(scenario, plan.slot)
     own = _initial(placed, plant, consists)
     track = np.unique([t.track for t in placed.train], return_inverse=True)[1].astype(np.int64)
-    start = own[0, POSITION] - scenario.topology.first_slot_m
+    front = int(np.argmin(plan.place))
+    start = own[consists.first[front], POSITION] - scenario.topology.first_slot_m
     if scenario.reference.follow_line:
-        followed = attempt(placing.followed, scenario, network and network[0], plan, consists, start)
-        scenario = scenario.model_copy(update={"reference": followed or Profile(speed_mps=scenario.train[0].speed_mps)})
+        followed = attempt(placing.followed, scenario, network and network[0], plan, consists, start, front)
+        scenario = scenario.model_copy(update={"reference": followed or Profile(speed_mps=scenario.train[front].speed_mps)})
     reference = scenario.reference.leader(start)
     first = graph.links(plan, graph.order_on_tracks(own[consists.first[:-1], POSITION], track), track)
     prepared = Prepared(
@@ -420,14 +422,16 @@ def _plan(scenario: Scenario) -> graph.Plan:
         if link.between:
             low, high = (None if x is None else -x for x in (link.upper_m, link.lower_m))
             said[b, a] = graph.Stated(None if link.desired_m is None else -link.desired_m, low, high, link.weight)
+    place = placing.places(scenario)
+    found += placing.against_the_order(scenario, place)
     rows = []
-    for k in range(len(ids) - 1):
-        own = said.get((k, k + 1), graph.Stated(None, None, None, None))
+    for k, m in pairwise(np.argsort(place).tolist()):
+        own = said.get((k, m), graph.Stated(None, None, None, None))
         desired = own.desired if own.desired is not None else top.spacing_m
         lower = own.lower if own.lower is not None else top.lower_m
         upper = own.upper if own.upper is not None else top.upper_m
         if desired is None:
-            found.append(f"topology.spacing_m: missing, and no [[link]] states desired_m between trains {ids[k]} and {ids[k + 1]}")
+            found.append(f"topology.spacing_m: missing, and no [[link]] states desired_m between trains {ids[k]} and {ids[m]}")
         rows.append((desired or 0.0, -math.inf if lower is None else lower, math.inf if upper is None else upper))
     if top.rule == "links" and not scenario.link and len(ids) > 1:
         found.append('topology.rule = links: there is no [[link]]; rule = "same_track" makes links by itself')
@@ -444,7 +448,7 @@ def _plan(scenario: Scenario) -> graph.Plan:
         rule=top.rule, equal=top.desired == "equal", first_slot=top.first_slot_m,
         desired=table[:, 0].copy(), lower=table[:, 1].copy(), upper=table[:, 2].copy(), weight=top.weight, stated=said,
         extra=tuple((a, b) for (a, b), link in pairs if link.extra),
-        fixed=tuple(both) if top.rule == "links" else (),
+        fixed=tuple(both) if top.rule == "links" else (), place=place,
     )  # fmt: skip
 
 

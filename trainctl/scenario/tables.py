@@ -142,7 +142,7 @@ class Topology(Table):
     )
     desired: Literal["slots", "equal"] = Field(
         "slots",
-        description="slots: every train keeps its place in the order of the [[train]] tables, a hole stays where one leaves; "
+        description="slots: every train keeps its place in the order of the starts, front to rear, a hole stays where one leaves; "
         "equal: neighbours keep spacing_m, the hole closes.",
     )
     spacing_m: Positive | None = Field(None, description="Desired spacing of consecutive trains, front to front [m].")
@@ -363,7 +363,7 @@ class Scenario(Table):
 
     @cached_property
     def ids(self) -> tuple[str, ...]:
-        """Train ids in formation order."""
+        """Train ids in the order of the tables."""
         return tuple(t.id for t in self.train)
 
     def cross_references(self, resolved: bool = False) -> list[str]:
