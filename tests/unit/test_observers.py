@@ -154,7 +154,7 @@ def test_error_obeys_the_matrix_exponential():
     xi, ex = errors(1.0, own, estimate)
     np.testing.assert_allclose(ex, ex0 * math.exp(-3.0), rtol=1e-8)
     for u in range(3):
-        A = error_matrix(constants.k2, constants.k3, constants.k4[u], constants.C[u], [1.0])
+        A = error_matrix(constants.k2[u], constants.k3[u], constants.k4[u], constants.C[u], [1.0])
         expected = expm(A) @ xi0[u]
         np.testing.assert_allclose(xi[u], expected, atol=1e-7 * np.abs(xi0[u]).max())
 
