@@ -132,7 +132,7 @@ class Loop(Steps):
         self.record.step(s.k, t, ways, here, seen, own, formed, demand, moved.motion, past, acting, watch)
         self.record.waits(t, here, speed, going, around, self.traffic.due(t, going), watch)
         world.move(moved.motion.displacement, p.scenario.run.step_s)
-        formed = formed.after(p.scenario.run.step_s, p.step_theta)
+        formed = self.topology.rule.after(formed)
         return State(
             s.k + 1, moved.own, pending, going, rule, formed, moved.messages, demand, memory, s.commanded, moved.state, watch
         )  # fmt: skip
