@@ -120,7 +120,8 @@ class Loop(Steps):
 
         def over_the_step(ordered: Floats, disturbed: Disturbed, state: plant.State, calm: bool) -> plant.Moved:
             moved = self.plant.step(s.k, t, own, demand, ordered, formed, messages, state, disturbed, calm)
-            return moved if around.view is None else self._held(moved, own, stands, here)
+            # Whoever is ordered not to start is held by its brakes, whatever pushes it.
+            return moved if around.view is None else self._held(moved, own, stands | (speed <= 0.0) & (ordered <= 0.0), here)
 
         moved, acts = self.protect.step(
             t, around.view, own, acceleration, driven, stands, acting, units, s.watch.acting, over_the_step

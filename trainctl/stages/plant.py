@@ -235,7 +235,7 @@ class Units:
         assert demanded is not None
         extras = self._extras(t, own, estimate, demanded, loop)
         force = own[:, FORCE].copy() if p.plant.STATES > FORCE else demanded
-        displacement = moved[heads, POSITION] - own[heads, POSITION] + np.where(own[heads, SPEED] > 0.0, disturbed.position, 0.0)
+        displacement = moved[heads, POSITION] - own[heads, POSITION] + disturbed.position
         clipped = displacement < 0.0
         displacement[clipped] = 0.0
         shift = np.repeat(own[heads, POSITION] + displacement - moved[heads, POSITION], np.diff(first))
