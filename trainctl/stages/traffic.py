@@ -70,9 +70,9 @@ class Traffic:
         self.step_s, self.theta = p.scenario.run.step_s, p.step_theta
         self.net, self.length = along.net(p.rails), p.consists.train_length()
         self.stops_of = np.array([len(stops) for stops in p.roster.stops], np.int64)
-        self.looks = p.supervision.mode != "off" or not p.placed
+        self.looks = p.looks_ahead
         planned = min(
-            p.supervision.emergency_mps2, p.supervision.service_mps2, *([] if p.placed else [p.driving.deceleration_mps2])
+            p.supervision.emergency_mps2, p.supervision.service_mps2, *([p.driving.deceleration_mps2] if p.driven else [])
         )
         self.claiming = np.minimum(p.assumed.braking, planned)  # what is claimed for, and braked with at least
         self.ways: Ways | None = None
@@ -81,7 +81,7 @@ class Traffic:
         """Before the run: trains that are placed have come."""
         n = len(self.length)
         return State(
-            came=np.full(n, self.p.placed), left=np.zeros(n, bool), next_stop=np.zeros(n, np.int64),
+            came=np.full(n, self.roster.placed), left=np.zeros(n, bool), next_stop=np.zeros(n, np.int64),
             stands_until=np.full(n, np.nan), stopping=np.zeros(n, bool), waits_for=np.full(n, -1), claims=interlocking.none(),
         )  # fmt: skip
 
@@ -260,7 +260,7 @@ class Traffic:
     def _look(self, ways: Ways, seen: Seen, speed: Floats, held: Held, s: State) -> View:
         """What is ahead of every train."""
         horizon = float(np.max(self._reach(speed), where=seen.present, initial=0.0)) + 1000.0
-        if not self.p.placed:
+        if self.p.driven:
             horizon = max(horizon, self.p.driving.join_range_m)
         return authority.look(
             ways, self.net, self.p.rails.speed_mps, self.roster.speed_factor, seen.row, seen.position, speed, self.length,
