@@ -319,7 +319,7 @@ def bound(runs: Runs) -> Iterator[Claim]:
     )  # fmt: skip
     alone = 2 * V0 * N * min(t.q) / H[0]  # n q max |psi_l(0) - psi_s(0)| eta2 >= n q v0 c eta2, c = 2 / (eta2 h)
     yield claim(
-        "h = 0.3 and a_ij = 0.01 follow from Assumption 2: rules of Assumption 2 and Theorem 1 broken from rest", 0, len(t.violated), "1",
+        "h = 0.3 and a_ij = 0.01 follow from Assumption 2: rules of Assumption 2 and Theorem 1 violated from rest", 0, len(t.violated), "1",
         not t.violated, f"Assumption 2 has no solution for eta2, whatever its 'B1 i T' is: 160 n q / h = {alone:.3g} m/s2 alone exceeds b2 = {t.b2_low[0]:.3g}; tried, too: eta2 = 1, "
         f"the most charitable, which gives {t.charitable_bound_m:.2g} m",
     )  # fmt: skip
