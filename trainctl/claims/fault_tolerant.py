@@ -17,7 +17,7 @@ from trainctl.plants import actuated_units as plant
 from trainctl.plants import integrate, point
 from trainctl.plants.faults import Fault, breaks
 from trainctl.scenario.reference import constant, s_curves
-from trainctl.signals import FORCE, Bounds, Consists, Extremes, Floats, Links, Reference, Scene
+from trainctl.signals import FORCE, Bounds, Consists, Extremes, Floats, Links, Reference, References, Scene
 
 CURVES = [
     (60.0, 240.0, 55.0), (400.0, 540.0, 80.0), (700.0, 800.0, 92.0), (1060.0, 1200.0, 65.0),
@@ -113,13 +113,14 @@ class Example:
         air = integrate.Air(np.zeros((2, law.MESSAGE)), self.period is None, True, 0.0)
         work = integrate.scratch(own, estimate, 3, observer.CORRECTIONS, law.MESSAGE)
         self.extremes = Extremes.fresh(3, 9, 3)
+        references = References.one(s.reference, len(s.trains))
         split = np.unique(np.concatenate([breaks(self.faults), s.reference.breaks[1:-1]]))
         sizes = [every, *([self.period] if self.period else []), *([NOISY.noise_hold_s] if self.seed is not None else [])]
         chunk, h = min(sizes), s.sub_step
         n = round(chunk / h)
         parts = integrate.compiled(
             law, observer, plant,
-            (loop, c.first, c.length, s.links, s.reference, air, 0.0, h, n, split, own, estimate, work, self.extremes),
+            (loop, c.first, c.length, s.links, references, air, 0.0, h, n, split, own, estimate, work, self.extremes),
         )  # fmt: skip
         history: list[tuple[Any, ...]] = []
         for k in range(round(duration / chunk)):
@@ -128,7 +129,7 @@ class Example:
                 moving.units[:, plant.NOISE] = plant.noise(NOISY, self.seed, round(t / NOISY.noise_hold_s), 9)
             if self.period and k % round(self.period / chunk) == 0:  # nothing has been heard yet at the start: the exact chain
                 integrate.exchange(
-                    parts, loop, c.first, s.links, s.reference, air._replace(live=k == 0), t, own, estimate, work
+                    parts, loop, c.first, s.links, references, air._replace(live=k == 0), t, own, estimate, work
                 )  # fmt: skip
                 air.heard[:] = work.sent[s.links.sender]
                 air = air._replace(sent_at=t)
@@ -137,7 +138,7 @@ class Example:
                     (t, own.copy(), observer.acceleration_estimate(observer_constants, estimate).copy(), observer.fault_estimate(observer_constants, estimate))
                 )  # fmt: skip
             applied = integrate.advance(
-                parts, loop, c.first, c.length, s.links, s.reference, air, t, h, n, split, own, estimate, work, self.extremes
+                parts, loop, c.first, c.length, s.links, references, air, t, h, n, split, own, estimate, work, self.extremes
             )
             if k % round(every / chunk) == 0:
                 history[-1] += (plant.fault(moving, t, applied),)
