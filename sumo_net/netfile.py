@@ -36,6 +36,7 @@ class NetFile(NamedTuple):
     connections: list[dict[str, str]]
     junctions: list[NetJunction]
     version: str  # of the format; "" if it says none
+    others: list[str]  # tags of all other elements
 
 
 def content(path: Path) -> bytes:
@@ -72,7 +73,7 @@ def read_net(path: Path) -> NetFile:
     LineError
         If there is no such file, it cannot be read, or it is not a net.
     """
-    net = NetFile([], [], [], "")
+    net = NetFile([], [], [], "", [])
     inside: NetEdge | NetJunction | None = None
     depth = 0
 
@@ -87,6 +88,8 @@ def read_net(path: Path) -> NetFile:
                 net.edges.append(inside := NetEdge(attributes, [], {}))
             elif tag == "junction":
                 net.junctions.append(inside := NetJunction(attributes, []))
+            else:
+                net.others.append(tag)
         elif depth == 3 and inside is not None:
             if tag == "lane" and isinstance(inside, NetEdge):
                 inside.lanes.append(attributes)

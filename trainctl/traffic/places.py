@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
-from sumo_net.netfile import RAIL, read_net
+from sumo_net.netfile import RAIL, NetFile, read_net
 from sumo_net.spec import LineError
 from trainctl.errors import InputError
 from trainctl.traffic.files import PLACES, Demand, bad_time
@@ -18,6 +18,7 @@ class Tracks(NamedTuple):
 
     length: dict[str, float]  # of lanes [m]
     onward: dict[str, set[str]]  # from each edge
+    file: NetFile
 
 
 class Place(NamedTuple):
@@ -43,7 +44,7 @@ def read_tracks(net: Path) -> Tracks:
             onward.setdefault(c["from"], set()).add(c["to"])
     except (KeyError, ValueError) as error:
         raise InputError(f"{net}: not a SUMO net: a lane or a connection has no {error}") from None
-    return Tracks(length, onward)
+    return Tracks(length, onward, file)
 
 
 def place_of(stop: Element, demand: Demand, tracks: Tracks) -> Place:

@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element
 
 from sumo_net.netfile import RAIL
 from trainctl.errors import InputError
-from trainctl.traffic.checks import rail_trains, refuse
+from trainctl.traffic.checks import not_followed, rail_trains, refuse
 from trainctl.traffic.duarouter import expand
 from trainctl.traffic.files import PLACES, Demand, bad_number, is_number, is_time, named_files, read_demand, read_options, seconds
 from trainctl.traffic.kinds import Kind, default_types, kind_of
@@ -108,6 +108,9 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         raise InputError(wrong)
     kinds = {name: kind_of(element) for name, element in (default_types() | demand.types).items()}
     trains, notes = rail_trains(demand, kinds)
+    more_notes, refused = not_followed(options, trains, demand, kinds, tracks.file)
+    if refused:
+        raise InputError([f"{sumocfg}: {line}" for line in refused])
     refuse(sumocfg, trains, demand, kinds, tracks)
     expanded = expand(trains, demand, net[0], work, begin, min(ends) if ends else None, seed)
     order = {train.get("id", ""): k for k, train in enumerate(trains)}
@@ -142,7 +145,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         begin_s=begin,
         end_s=own_end,
         step_s=times["step-length"],
-        notes=tuple(notes),
+        notes=(*notes, *more_notes),
     )
 
 
