@@ -15,7 +15,7 @@ from trainctl.errors import LawError
 from trainctl.numeric import lay_out
 from trainctl.plants import disturbance
 from trainctl.railway.ways import under
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.scenario.tables import Event
 from trainctl.signals import POSITION, SPEED, Bools, Demand, Disturbed, Floats, Formed, Messages, Motion, Seen, Start
 from trainctl.stages import control, driver, orders, plant, protect, record, topology, traffic

@@ -39,7 +39,8 @@ from trainctl.record.folder import (
 )  # fmt: skip
 from trainctl.runs.run import Run
 from trainctl.scenario import promise, roster
-from trainctl.scenario.build import Prepared, prepare
+from trainctl.scenario.build import prepare
+from trainctl.scenario.model import Prepared
 from trainctl.scenario.reading import examine
 from trainctl.stages.record import Journal
 from trainctl.steps import Steps

@@ -22,7 +22,8 @@ from trainctl.loop import Loop
 from trainctl.record.folder import remove
 from trainctl.runner import Backend, opened, resume, run
 from trainctl.runs.run import Run
-from trainctl.scenario.build import Prepared, open_scenario
+from trainctl.scenario.build import open_scenario
+from trainctl.scenario.model import Prepared
 
 BIN = Path(sys.executable).parent / "trainctl"
 TABLES = ("trains.parquet", "units.parquet", "links.parquet")

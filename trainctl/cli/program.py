@@ -29,7 +29,7 @@ from trainctl.errors import InputError, TrainctlError
 
 if TYPE_CHECKING:
     from trainctl.runs.run import Run
-    from trainctl.scenario.build import Prepared
+    from trainctl.scenario.model import Prepared
 
 
 @app.command()

@@ -21,7 +21,7 @@ from trainctl.signals import Floats, Ints
 
 if TYPE_CHECKING:
     from trainctl.railway.ways import Ways
-    from trainctl.scenario.build import Prepared
+    from trainctl.scenario.model import Prepared
     from trainctl.signals import Row, Seen
     from trainctl.stages.traffic import Around
     from trainctl.stages.traffic import State as Traffic

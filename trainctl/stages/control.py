@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from trainctl.errors import LawError
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.signals import POSITION, SPEED, Demand, Disturbed, Floats, Formed, Messages, Trains
 from trainctl.topology import exchange
 

@@ -13,7 +13,7 @@ import numpy as np
 from trainctl.railway import along
 from trainctl.railway.authority import View
 from trainctl.railway.supervisor import SWITCH
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.signals import POSITION, SPEED, Bools, Floats, Formed, Ints, Links, Pace, Reference, Seen, restrict
 from trainctl.stages.record import Journal
 from trainctl.stages.traffic import SOON_S, Around

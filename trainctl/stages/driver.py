@@ -9,7 +9,7 @@ import numpy as np
 from trainctl.railway import authority, supervisor
 from trainctl.railway.authority import View
 from trainctl.railway.supervisor import STOP
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.signals import Bools, Floats, Formed
 from trainctl.stages.traffic import Around
 from trainctl.stages.traffic import State as Traffic

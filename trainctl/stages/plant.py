@@ -10,7 +10,7 @@ import numpy as np
 
 from trainctl.davis import resistance
 from trainctl.plants import coupled_units, faults, integrate, point, shared
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.signals import (
     FORCE,
     GRAVITY,

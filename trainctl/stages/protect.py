@@ -10,7 +10,7 @@ import numpy as np
 from trainctl.railway import authority, supervisor
 from trainctl.railway.authority import View
 from trainctl.railway.supervisor import KINDS, applied
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.signals import SPEED, Bools, Disturbed, Floats
 from trainctl.stages import plant
 from trainctl.stages.driver import Driven

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from trainctl.railway.ways import Ways
-    from trainctl.scenario.build import Prepared
+    from trainctl.scenario.model import Prepared
     from trainctl.stages.traffic import Around
     from trainctl.stages.traffic import State as Traffic
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.signals import Floats, Formed, Ints, Links, Seen
 from trainctl.stages.record import Journal
 from trainctl.stages.traffic import Around

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.signals import Floats, Formed, Links, Messages, Scene, Seen
 from trainctl.stages.convoys import Convoys
 from trainctl.stages.record import Journal

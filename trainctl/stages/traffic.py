@@ -12,7 +12,7 @@ from trainctl.railway import along, authority, interlocking, supervisor
 from trainctl.railway.authority import DRIVER_MARGIN_M, View
 from trainctl.railway.interlocking import Held
 from trainctl.railway.ways import Ways
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.scenario.roster import Stop
 from trainctl.signals import Bools, Floats, Ints, Seen
 from trainctl.stages.record import Journal

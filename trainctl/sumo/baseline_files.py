@@ -10,7 +10,7 @@ import numpy as np
 
 from sumo_net.netfile import content
 from trainctl.errors import InputError
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.signals import SPEED, Floats
 from trainctl.sumo.session import OPTIONS, fcd_period, normal
 
