@@ -56,7 +56,7 @@ CASES = {
         [(CONFIGURATION, "", "<net/>")], ["merging.sumocfg: not a SUMO configuration: it begins with <net>, not <sumoConfiguration>"],
     ),
     "configuration without routes": (
-        [(CONFIGURATION, '<route-files value="merging.rou.xml"/>', "")], ["merging.sumocfg: no route-files"],
+        [(CONFIGURATION, '<route-files value="merging.rou.xml"/>', "")], ["merging.sumocfg: no route-files, nor additional-files with trains in them"],
     ),
     "routes are neither": ([(ROUTES, "", "<net/>")], ["merging.sumocfg: no trains: no vehicle, trip or flow has a vType of a rail class"]),
     "trains of its own": (

@@ -238,7 +238,6 @@ def test_what_is_not_followed_is_told(files: Files) -> None:
         "1 definitions of containers left out",
         "2 vehicles, trips and flows left out: not rail",
         'departPos="random": the train begins with its rear at the beginning of the edge, as with "base"',
-        'departSpeed="avg": as fast as allowed',
         "vType loose: speedFactor = normc(0.8,0.1,0.2,1): its mean 0.8 for every train",
         "option step-length = 0.5: not followed: the step is run.step_s of the scenario",
         "1 x <vehicle arrivalSpeed>: not followed: trains leave as fast as they come",
@@ -370,7 +369,10 @@ def test_files_that_are_not_what_they_should_be(files: Files) -> None:
     assert told('<configuration><net-file value="other.net.xml"/><route-files value="list.xml"/></configuration>') == [
         "F/other.net.xml: not a SUMO net: its root element is <nodes>, not <net>"
     ]
-    assert told("<configuration/>") == ["F/run.sumocfg: no net-file", "F/run.sumocfg: no route-files"]
+    assert told("<configuration/>") == [
+        "F/run.sumocfg: no net-file",
+        "F/run.sumocfg: no route-files, nor additional-files with trains in them",
+    ]
     assert told(f'<configuration>{net}<route-files value="a.xml,b.xml"/><end value="soon"/></configuration>') == [
         "F/run.sumocfg: F/a.xml: no such file",
         "F/run.sumocfg: F/b.xml: no such file",

@@ -31,8 +31,8 @@ def rail_trains(demand: Demand, kinds: dict[str, Kind]) -> tuple[list[Element], 
     notes += [
         f'departPos="{p}": the train begins with its rear at the beginning of the edge, as with "base"' for p in sorted(places)
     ]
-    speeds = {t.get("departSpeed", "") for t in trains} & {"random", "last", "avg"}
-    notes += [f'departSpeed="{s}": as fast as allowed' for s in sorted(speeds)]
+    if any(t.get("departSpeed") == "random" for t in trains):
+        notes.append('departSpeed="random": as fast as allowed')
     if any(t.get("arrivalPos") == "random" for t in trains):
         notes.append('arrivalPos="random": at the end of the edge')
     drawn = {t.get("type", "") for t in trains}
@@ -85,7 +85,7 @@ def refuse(sumocfg: Path, trains: list[Element], demand: Demand, kinds: dict[str
             stops = [*route.iter("stop"), *(s for s in train if s.tag == "stop")]
             places = [place_of(s, demand, tracks) for s in stops]
             wrong += [f"{who}: {p.wrong}" for p in places if p.wrong]
-            if not route.get("repeat") and not any(p.wrong for p in places):
+            if not {"repeat", "departEdge", "arrivalEdge"} & {*route.keys(), *train.keys()} and not any(p.wrong for p in places):
                 wrong += [f"{who}: {m}" for m in off_route(tuple(route.get("edges", "").split()), places)]
     if wrong:
         raise InputError(list(dict.fromkeys(wrong)))

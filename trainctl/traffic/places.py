@@ -10,7 +10,10 @@ from xml.etree.ElementTree import Element
 from sumo_net.netfile import RAIL, NetFile, read_net
 from sumo_net.spec import LineError
 from trainctl.errors import InputError
-from trainctl.traffic.files import PLACES, Demand, bad_time
+from trainctl.traffic.files import PLACES, Demand, bad_number, bad_time, is_time, seconds
+
+#: How SUMO's files say yes.
+YES = ("1", "true", "yes", "on", "x", "t")
 
 
 class Tracks(NamedTuple):
@@ -65,7 +68,10 @@ def place_of(stop: Element, demand: Demand, tracks: Tracks) -> Place:
     if lane not in tracks.length:
         return Place(lane, 0.0, f"{said}: lane {lane}: not in the net")
     length = tracks.length[lane]
-    said_wrong = [f"{key} = {stop.get(key)}" for key in ("duration", "until") if bad_time(stop.get(key, "0"))]
+    # A duration below 0 is none.
+    said_wrong = [] if is_time(stop.get("duration", "0")) else [f"duration = {stop.get('duration')}"]
+    said_wrong += [f"until = {stop.get('until')}"] if bad_time(stop.get("until", "0")) else []
+    said_wrong += [f"speed = {stop.get('speed')}"] if bad_number(stop.get("speed")) else []
     try:
         position = float(where.get("endPos", length))
     except ValueError:
@@ -74,13 +80,15 @@ def place_of(stop: Element, demand: Demand, tracks: Tracks) -> Place:
     if said_wrong:
         return Place(lane, 0.0, f"{said}: {', '.join(said_wrong)}: must be a number, a time not negative")
     position += length if position < 0 else 0.0
-    if where.get("friendlyPos", "0").lower() in ("1", "true", "yes", "on", "x", "t"):
+    if where.get("friendlyPos", "0").lower() in YES:
         position = min(max(position, 0.0), length)
     # SUMO itself lets a stop be a bit beyond the end.
     if not 0.0 <= position <= length + 0.1:
         return Place(lane, 0.0, f"{said}: endPos = {where.get('endPos')}: off the edge, which is {length:g} m long")
     wrong = ""
-    if not name and stop.get("duration") is None and stop.get("until") is None:
+    ends = seconds(stop.get("duration", "-1")) >= 0 or stop.get("until") is not None
+    triggered = any(stop.get(key, "false").lower() in YES for key in ("triggered", "containerTriggered"))
+    if not name and not ends and not triggered and float(stop.get("speed", "0")) == 0:
         wrong = f"{said}: neither duration nor until"
     return Place(lane, min(position, length), wrong)
 
@@ -93,12 +101,12 @@ def unconnected(edges: list[str], tracks: Tracks) -> list[str]:
     ]
 
 
-def off_route(edges: tuple[str, ...], places: list[Place]) -> list[str]:
-    """Stops that a train does not come to, one after the other."""
+def off_route(edges: tuple[str, ...], places: list[Place], firsts: list[int] | None = None) -> list[str]:
+    """Stops that a train does not come to, one after the other; each on the edge of this number in ``firsts`` or a later one."""
     wrong, at, behind = [], 0, 0.0
-    for place in places:
+    for place, first in zip(places, firsts or [0] * len(places), strict=True):
         edge = place.lane.rpartition("_")[0]
-        start = at + 1 if edges[at : at + 1] == (edge,) and place.position_m < behind else at
+        start = max(at + 1 if edges[at : at + 1] == (edge,) and place.position_m < behind else at, first)
         if edge in edges[start:]:
             at, behind = edges.index(edge, start), place.position_m
         elif edge in edges:
