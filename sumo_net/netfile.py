@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 from xml.parsers import expat
@@ -12,6 +13,17 @@ from sumo_net.spec import LineError
 
 #: Vehicle classes that make an edge a railway.
 RAIL = frozenset(("rail", "rail_electric", "rail_fast", "rail_urban", "tram", "subway", "cable_car"))
+
+
+def for_trains(lane: Mapping[str, str], anybody: bool = False) -> bool:
+    """Whether a lane is for trains: it allows a rail class by name, or where ``anybody`` counts does not keep them out."""
+    if not RAIL.isdisjoint(lane.get("allow", "").split()):
+        return True
+    return anybody and lane.get("allow", "all") == "all" and not _keeps_out(lane.get("disallow", "").split())
+
+
+def _keeps_out(disallowed: list[str]) -> bool:
+    return "all" in disallowed or set(disallowed) >= RAIL
 
 
 class NetEdge(NamedTuple):

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import re
-import subprocess
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import nets
-import numpy as np
 import pytest
 import tomli_w
+from beside import followed, plain
 
-from sumo_net.build import program
 from trainctl.runner import run
 from trainctl.runs.run import Run
 from trainctl.scenario.build import open_scenario
-
-OPEN = "<configuration>"
 
 
 @pytest.fixture
@@ -35,30 +29,6 @@ def ring(tmp_path):
     nodes = {"a": (0, 0), "b": (2000, 0), "c": (2000, 2000), "d": (0, 2000)}
     nets.net(tmp_path, nodes, {f"{x}{y}": (x, y) for x, y in ("ab", "bc", "cd", "da")})
     return tmp_path
-
-
-def followed(folder: Path, body: str, duration: float, options: str = "", backends: tuple[str, ...] = ("sumo", "numeric")) -> Run:
-    """The run of one demand, which has the same positions without a simulator."""
-    nets.traffic(folder, body)
-    configuration = folder / "a.sumocfg"
-    configuration.write_text(configuration.read_text().replace(OPEN, f"{OPEN}{options}"))
-    (folder / "s.toml").write_text(tomli_w.dumps(nets.scenario("robust_constrained", duration)))
-    p = open_scenario(str(folder / "s.toml"))
-    runs = [run(p, folder / f"out_{backend}", backend) for backend in backends]  # type: ignore[arg-type]
-    for other in runs[1:]:
-        assert len(runs[0].trains) == len(other.trains)
-        assert np.max(np.abs(runs[0].trains.position_m - other.trains.position_m)) < 1e-6
-    assert not [e for e in runs[0].events if e["kind"] in ("violation", "sumo_warning")]
-    return runs[0]
-
-
-def plain(folder: Path, rows: str, *options: str) -> list[dict[str, str]]:
-    """Rows of an output of plain SUMO on the same files."""
-    sumo, environment = program("sumo")
-    subprocess.run([sumo, "-c", "a.sumocfg", f"--{rows}-output", "plain.xml", "--no-step-log", *options], cwd=folder, env=environment,
-                   check=True, capture_output=True)  # fmt: skip
-    tag = {"stop": "stopinfo"}.get(rows, rows)
-    return [dict(re.findall(r'(\w+)="([^"]*)"', row)) for row in re.findall(rf"<{tag} [^>]*>", (folder / "plain.xml").read_text())]
 
 
 def events(found: Run, kind: str) -> list[dict[str, Any]]:

@@ -90,7 +90,7 @@ def from_tables(data: Mapping[str, Any], net: Path) -> Roster:
         vclass=tuple(data["vclass"]),
         patience=float(data["patience"]),
         notes=tuple(data["notes"]),
-        rails=Rails.read(net),
+        rails=Rails.read(net, {e for route in data["routes"] for e in route}),
         placed=False,
     )
 
@@ -128,7 +128,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
     with tempfile.TemporaryDirectory(prefix="traffic.") as work:
         traffic = read_traffic(folder / str(scenario.network.sumocfg), Path(work), scenario.run.duration_s)
     try:
-        rails = Rails.read(traffic.net)
+        rails = Rails.read(traffic.net, {e for d in traffic.departures for e in d.edges})
     except LineError as error:
         raise InputError([f"network.sumocfg: {m}" for m in error.mistakes]) from None
     types, found = _types(scenario, traffic)

@@ -122,7 +122,7 @@ def write_routes(p: Prepared, trains: list[Departure], path: Path) -> None:
     ]
     for d, key in sorted(zip(trains, keys, strict=True), key=lambda pair: pair[0].depart):
         given = {
-            "id": d.id, "type": kinds[key], "depart": f"{d.depart:.3f}", "departLane": "0", "departPos": repr(d.position_m),
+            "id": d.id, "type": kinds[key], "depart": f"{d.depart:.3f}", "departLane": "best", "departPos": repr(d.position_m),
             "departSpeed": None if d.speed is None else repr(d.speed), "insertionChecks": "none" if d.placed else None,
             "arrivalPos": None if np.isinf(d.arrival_m) else repr(d.arrival_m),
         }  # fmt: skip

@@ -89,7 +89,7 @@ def write_routes(start: Start, path: Path) -> list[str]:
         route = " ".join(normal(start.routes[i]))
         arrival = arrival_word(np.inf if start.arrival is None else float(start.arrival[i]))
         rows.append(
-            f'    <vehicle id={quoteattr(name)} type="{kinds[-1]}" depart="0" departLane="0" insertionChecks="none"'
+            f'    <vehicle id={quoteattr(name)} type="{kinds[-1]}" depart="0" departLane="best" insertionChecks="none"'
             f' departPos="{float(start.lane_position[i])!r}" departSpeed="{float(start.speed[i])!r}" arrivalPos="{arrival}">\n'
             f'        <route edges="{route}"/>\n    </vehicle>\n'
         )
@@ -344,7 +344,7 @@ class Sumo(Session):
         name = self.ids[train]
         self._call(self.api.route.add, f"way_{name}", normal(self.routes[train]))
         self._call(
-            self.api.vehicle.add, name, f"way_{name}", typeID=self.kinds[train], depart="now", departLane="first",
+            self.api.vehicle.add, name, f"way_{name}", typeID=self.kinds[train], depart="now", departLane="best",
             departPos=repr(float(self.departs_m[train])), departSpeed=repr(speed),
             arrivalPos=arrival_word(float(self.arrival[train])),
         )  # fmt: skip

@@ -11,7 +11,7 @@ from trainctl.errors import InputError
 from trainctl.traffic import known
 from trainctl.traffic.files import PEOPLE, PLACES, Demand, is_time, routes_of, types_of
 from trainctl.traffic.kinds import Kind
-from trainctl.traffic.places import Tracks, off_route, place_of, unconnected
+from trainctl.traffic.places import NO_RAIL, Tracks, off_route, place_of, unconnected
 
 
 def rail_trains(demand: Demand, kinds: dict[str, Kind]) -> tuple[list[Element], list[str]]:
@@ -58,8 +58,12 @@ def not_followed(
     return [*known.of_options(options), *notes, *known.of_others(demand.others), *known.of_net(net)], refused
 
 
-def refuse(sumocfg: Path, trains: list[Element], demand: Demand, kinds: dict[str, Kind], tracks: Tracks) -> None:
+def refuse(sumocfg: Path, net: Path, trains: list[Element], demand: Demand, kinds: dict[str, Kind], tracks: Tracks) -> None:
     """Refuse trains whose names, types, times, routes or stops cannot be: one line for each mistake."""
+    met = {e for t in trains for key in ("from", "via", "to") for e in t.get(key, "").split()}
+    met |= {e for t in trains for route in routes_of(t, demand) for e in route.get("edges", "").split()}
+    if trains and not tracks.marked and not met & tracks.onward.keys():
+        raise InputError(f"{net}: {NO_RAIL}")
     if not trains:
         raise InputError(f"{sumocfg}: no trains: no vehicle, trip or flow has a vType of a rail class ({', '.join(sorted(RAIL))})")
     wrong = []

@@ -195,10 +195,12 @@ ELEMENTS_OF_NO_EFFECT = _words(
 NET_ELEMENTS = _words("location type edge junction connection prohibition roundabout param")
 #: Attributes of edges, lanes and connections that matter, and those that only draw.
 NET_EDGE = _words("id from to priority type function bidi distance spreadType shape name length crossingEdges routingType")
-NET_LANE = _words("id index allow disallow speed length width shape endOffset customShape type acceleration outlineShape")
+NET_LANE = _words(
+    "id index allow disallow speed length width shape endOffset customShape type acceleration outlineShape changeLeft changeRight",
+)
 NET_CONNECTION = _words(
     "from to fromLane toLane via dir state tl linkIndex linkIndex2 pass keepClear contPos visibility shape uncontrolled length",
-    "speed customLength",
+    "speed customLength allow disallow changeLeft changeRight indirect fringe",
 )
 
 
@@ -276,11 +278,7 @@ def _unknown(net: NetFile) -> Iterator[str]:
     for edge in net.edges:
         yield from (f"<edge {key}>" for key in edge.attributes.keys() - NET_EDGE)
         for lane in edge.lanes:
-            yield from (f"<lane {key}>" for key in lane.keys() - NET_LANE if key not in ("changeLeft", "changeRight"))
+            yield from (f"<lane {key}>" for key in lane.keys() - NET_LANE)
     for connection in net.connections:
-        yield from (
-            f"<connection {key}>"
-            for key in connection.keys() - NET_CONNECTION
-            if key not in ("allow", "disallow", "changeLeft", "changeRight", "indirect", "fringe")
-        )
+        yield from (f"<connection {key}>" for key in connection.keys() - NET_CONNECTION)
     yield from (f"<{tag}>" for tag in net.others if tag not in NET_ELEMENTS and tag != "tlLogic")

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
-from sumo_net.netfile import RAIL, NetFile, read_net
+from sumo_net.netfile import NetFile, for_trains, read_net
 from sumo_net.spec import LineError
 from trainctl.errors import InputError
 from trainctl.traffic.files import PLACES, Demand, bad_number, bad_time, is_time, seconds
+
+#: What is said of a road net.
+NO_RAIL = "has no rail edges: none of its lanes allows a rail class by name, and no route runs over one that lets everybody on"
+
 
 #: How SUMO's files say yes.
 YES = ("1", "true", "yes", "on", "x", "t")
@@ -22,6 +27,7 @@ class Tracks(NamedTuple):
     length: dict[str, float]  # of lanes [m]
     onward: dict[str, set[str]]  # from each edge
     file: NetFile
+    marked: bool  # it has lanes that allow a rail class by name
 
 
 class Place(NamedTuple):
@@ -38,8 +44,9 @@ def read_tracks(net: Path) -> Tracks:
         file = read_net(net)
     except LineError as error:
         raise InputError(error.mistakes) from None
-    if not any(not RAIL.isdisjoint(lane.get("allow", "").split()) for edge in file.edges for lane in edge.lanes):
-        raise InputError(f"{net}: has no rail edges: none of its lanes allows a rail class by name")
+    normal = [e for e in file.edges if e.attributes.get("function", "normal") == "normal"]
+    if not any(for_trains(lane, anybody=True) for edge in normal for lane in edge.lanes):
+        raise InputError(f"{net}: {NO_RAIL}")
     onward: dict[str, set[str]] = {edge.attributes.get("id", ""): set() for edge in file.edges}
     try:
         length = {lane["id"]: float(lane["length"]) for edge in file.edges for lane in edge.lanes}
@@ -47,7 +54,13 @@ def read_tracks(net: Path) -> Tracks:
             onward.setdefault(c["from"], set()).add(c["to"])
     except (KeyError, ValueError) as error:
         raise InputError(f"{net}: not a SUMO net: a lane or a connection has no {error}") from None
-    return Tracks(length, onward, file)
+    return Tracks(length, onward, file, any(for_trains(lane) for edge in normal for lane in edge.lanes))
+
+
+def unmarked(edges: Iterable[str], tracks: Tracks) -> list[str]:
+    """Edges of routes that are no track by name, but let everybody on."""
+    lanes = {e.attributes.get("id", ""): e.lanes for e in tracks.file.edges}
+    return [e for e in dict.fromkeys(edges) if not any(for_trains(lane) for lane in lanes.get(e, []))]
 
 
 def place_of(stop: Element, demand: Demand, tracks: Tracks) -> Place:

@@ -13,6 +13,7 @@ from xml.etree.ElementTree import Element
 
 from sumo_net.netfile import RAIL
 from trainctl.errors import InputError
+from trainctl.traffic import crossings
 from trainctl.traffic.checks import not_followed, rail_trains, refuse
 from trainctl.traffic.duarouter import expand
 from trainctl.traffic.files import (
@@ -28,8 +29,9 @@ from trainctl.traffic.files import (
     seconds,
 )
 from trainctl.traffic.kinds import Kind, default_types, kind_of
-from trainctl.traffic.places import YES, Tracks, off_route, place_of, read_tracks, unconnected
+from trainctl.traffic.places import YES, Tracks, off_route, place_of, read_tracks, unconnected, unmarked
 from trainctl.traffic.scale import scaled
+from trainctl.traffic.trial import in_doubt, tried
 
 #: What SUMO takes in place of a number; the first is its default.
 _WORDS = {
@@ -142,10 +144,12 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
     more_notes, refused = not_followed(options, trains, demand, kinds, tracks.file)
     if refused:
         raise InputError([f"{sumocfg}: {line}" for line in refused])
-    refuse(sumocfg, trains, demand, kinds, tracks)
+    refuse(sumocfg, net[0], trains, demand, kinds, tracks)
     if float(scale) != 1.0:
         trains, scale_notes = scaled(trains, float(scale), options.get("scale-suffix", "."))
         notes += scale_notes
+    if in_doubt(net[0], tracks.file):
+        tried(net[0])
     expanded = expand(trains, demand, net[0], work, begin, min(ends) if ends else None, seed)
     order = {train.get("id", ""): k for k, train in enumerate(trains)}
     made = {vehicle.get("id", "") for vehicle in expanded}
@@ -172,6 +176,11 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         raise InputError(f"{sumocfg}: no train departs at begin = {begin:g} or later{until}")
     departures.sort(key=lambda d: (d[1].depart_s, d[0]))
     used = {d.kind for _, d in departures}
+    if plain := unmarked((e for _, d in departures for e in d.edges), tracks):
+        notes.append(
+            f"net: {len(plain)} x edges of routes let everybody on, no rail class by name: tracks without their road traffic"
+        )
+    notes += crossings.told(tracks.file, [d.edges for _, d in departures])
     return Traffic(
         net=net[0],
         departures=tuple(d for _, d in departures),
