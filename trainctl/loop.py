@@ -120,7 +120,8 @@ class Loop(Steps):
 
         def over_the_step(ordered: Floats, disturbed: Disturbed, state: plant.State, calm: bool) -> plant.Moved:
             moved = self.plant.step(s.k, t, own, demand, ordered, formed, messages, state, disturbed, calm)
-            return moved if around.view is None else self._held(moved, own, stands, here)
+            # Whoever is ordered not to start is held by its brakes, whatever pushes it.
+            return moved if around.view is None else self._held(moved, own, stands | (speed <= 0.0) & (ordered <= 0.0), here)
 
         moved, acts = self.protect.step(
             t, around.view, own, acceleration, driven, stands, acting, units, s.watch.acting, over_the_step
@@ -132,7 +133,7 @@ class Loop(Steps):
         self.record.step(s.k, t, ways, here, seen, own, formed, demand, moved.motion, past, acting, watch)
         self.record.waits(t, here, speed, going, around, self.traffic.due(t, going), watch)
         world.move(moved.motion.displacement, p.scenario.run.step_s)
-        formed = formed.after(p.scenario.run.step_s, p.step_theta)
+        formed = self.topology.rule.after(formed)
         return State(
             s.k + 1, moved.own, pending, going, rule, formed, moved.messages, demand, memory, s.commanded, moved.state, watch
         )  # fmt: skip

@@ -25,7 +25,7 @@ from trainctl.controllers import fault_tolerant as law
 from trainctl.observers import asymptotic, intermediate
 from trainctl.plants import actuated_units as plant
 from trainctl.plants import integrate
-from trainctl.signals import Extremes
+from trainctl.signals import Extremes, References
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,22 @@ def small_steps(every: float, duration: float) -> tuple[Example, list[np.ndarray
     air = integrate.Air(np.zeros((2, law.MESSAGE)), True, True, 0.0)
     work, extremes = integrate.scratch(own, estimate, 3, 5, 4), Extremes.fresh(3, 9, 3)
     c, n = s.consists, round(every / 0.002)
-    arguments = (loop, c.first, c.length, s.links, s.reference, air, 0.0, 0.002, n, np.zeros(0), own, estimate, work, extremes)
+    arguments = (
+        loop,
+        c.first,
+        c.length,
+        s.links,
+        References.one(s.reference, len(s.trains)),
+        air,
+        0.0,
+        0.002,
+        n,
+        np.zeros(0),
+        own,
+        estimate,
+        work,
+        extremes,
+    )
     parts = integrate.compiled(law, asymptotic, plant, arguments)
     states, estimates = [own.copy()], [estimate.copy()]
     for k in range(round(duration / every)):
@@ -79,7 +94,7 @@ def small_steps(every: float, duration: float) -> tuple[Example, list[np.ndarray
             c.first,
             c.length,
             s.links,
-            s.reference,
+            References.one(s.reference, len(s.trains)),
             air,
             k * every,
             0.002,

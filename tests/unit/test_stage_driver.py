@@ -82,12 +82,12 @@ def test_limits_stops_and_trains_ahead_are_braked_for(p):
 def test_the_reference_of_a_formation_heeds_limits_of_all_and_what_is_ahead_of_its_first(p):
     cab = Cab(p)
     cab.formed = chained(cab.formed, [-1, 0] + [-1] * (cab.n - 2))
-    cab.formed.pace.speed[:] = 35.0
+    cab.formed.references.pace.speed[:] = 35.0
     driven, formed = cab.step(cab.alone(limits=Limits(np.array([1]), np.array([0.0]), np.array([30.0]))))
     assert np.isnan(driven.ordered[:2]).all() and np.isfinite(driven.ordered[2:]).all()  # the law drives the two
-    assert formed.pace.acceleration[0] == formed.pace.acceleration[1] < -0.1
+    assert formed.references.pace.acceleration[0] == formed.references.pace.acceleration[1] < -0.1
     _, formed = cab.step(cab.alone(targets=target(1, 100.0, 35.0, TRAIN, moving=True, other=0)))  # the law looks after that
-    np.testing.assert_allclose(formed.pace.acceleration, 0.0)
+    np.testing.assert_allclose(formed.references.pace.acceleration, 0.0)
 
 
 def test_a_train_that_stands_at_a_stop_is_held_and_so_is_one_that_may_not_go(p):

@@ -13,7 +13,7 @@ from trainctl.claims.claim import Claim, claim, span
 from trainctl.controllers import emu_finite_time as law
 from trainctl.observers import none
 from trainctl.plants import coupled_units, integrate
-from trainctl.signals import Bounds, Consists, Extremes, Floats, Links, Reference, Scene
+from trainctl.signals import Bounds, Consists, Extremes, Floats, Links, Reference, References, Scene
 
 KMH = 1.0 / 3.6
 DAVIS = (0.01176, 7.7616e-4, 1.6e-5)
@@ -94,11 +94,11 @@ def run(scene: Scene, seconds: int, params: law.Params | None = None, step: floa
     air = integrate.Air(np.zeros((len(links.sender), law.MESSAGE)), period is None, False, 0.0)
     work = integrate.scratch(own, estimate, len(scene.trains), none.CORRECTIONS, law.MESSAGE)
     extremes = Extremes.fresh(len(scene.trains), len(own), len(law.WATCHED))
-    first, length, reference = scene.consists.first, scene.consists.length, scene.reference
-    breaks = reference.breaks[1:-1].copy()
+    first, length, references = scene.consists.first, scene.consists.length, References.one(scene.reference, len(scene.trains))
+    breaks = scene.reference.breaks[1:-1].copy()
 
     def arguments(t: float, n: int) -> tuple[object, ...]:
-        return loop, first, length, links, reference, air, t, step, n, breaks, own, estimate, work, extremes
+        return loop, first, length, links, references, air, t, step, n, breaks, own, estimate, work, extremes
 
     parts = integrate.compiled(law, none, coupled_units, arguments(0.0, 1))
     states = np.empty((seconds + 1, *own.shape))
@@ -108,7 +108,7 @@ def run(scene: Scene, seconds: int, params: law.Params | None = None, step: floa
     for k in range(round(seconds / share)):
         t = k * share
         if period is not None and k % round(period / share) == 0:
-            integrate.exchange(parts, loop, first, links, reference, air, t, own, estimate, work)
+            integrate.exchange(parts, loop, first, links, references, air, t, own, estimate, work)
             air.heard[:] = work.sent[links.sender]
             air = air._replace(sent_at=t)
         integrate.advance(parts, *arguments(t, round(share / step)))  # type: ignore[arg-type]

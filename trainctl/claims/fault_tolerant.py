@@ -17,7 +17,7 @@ from trainctl.plants import actuated_units as plant
 from trainctl.plants import integrate
 from trainctl.plants.faults import Fault, breaks
 from trainctl.scenario.reference import s_curves
-from trainctl.signals import Bounds, Consists, Extremes, Links, Scene
+from trainctl.signals import Bounds, Consists, Extremes, Links, References, Scene
 
 CURVES = [
     (60.0, 240.0, 55.0), (400.0, 540.0, 80.0), (700.0, 800.0, 92.0), (1060.0, 1200.0, 65.0),
@@ -103,7 +103,7 @@ class Example:
         n = round(chunk / h)
         parts = integrate.compiled(
             law, self.observer, plant,
-            (loop, c.first, c.length, s.links, s.reference, air, 0.0, h, n, split, own, estimate, work, self.extremes),
+            (loop, c.first, c.length, s.links, References.one(s.reference, len(s.trains)), air, 0.0, h, n, split, own, estimate, work, self.extremes),
         )  # fmt: skip
         history: list[tuple[Any, ...]] = []
         for k in range(round(duration / chunk)):
@@ -112,14 +112,28 @@ class Example:
                 moving.units[:, plant.NOISE] = plant.noise(NOISY, self.seed, round(t / NOISY.noise_hold_s), 9)
             if self.period and k % round(self.period / chunk) == 0:  # nothing has been heard yet at the start: the exact chain
                 integrate.exchange(
-                    parts, loop, c.first, s.links, s.reference, air._replace(live=k == 0), t, own, estimate, work
+                    parts, loop, c.first, s.links, References.one(s.reference, len(s.trains)), air._replace(live=k == 0), t, own, estimate, work
                 )  # fmt: skip
                 air.heard[:] = work.sent[s.links.sender]
                 air = air._replace(sent_at=t)
             if k % round(every / chunk) == 0:
                 history.append((t, own.copy(), estimate.copy(), self.observer.fault_estimate(observer_constants, estimate)))
             applied = integrate.advance(
-                parts, loop, c.first, c.length, s.links, s.reference, air, t, h, n, split, own, estimate, work, self.extremes
+                parts,
+                loop,
+                c.first,
+                c.length,
+                s.links,
+                References.one(s.reference, len(s.trains)),
+                air,
+                t,
+                h,
+                n,
+                split,
+                own,
+                estimate,
+                work,
+                self.extremes,
             )
             if k % round(every / chunk) == 0:
                 history[-1] += (plant.fault(moving, t, applied),)

@@ -25,6 +25,7 @@ from trainctl.signals import (
     Messages,
     Motion,
     PointPlant,
+    References,
     Scene,
     UnitPlant,
 )  # fmt: skip
@@ -152,8 +153,6 @@ class Units:
         self.orders = integrate.Orders(
             held=shared.constants(p.plant_params, p.consists, self.gradient) if ordered and not p.sampled else shared.NOBODY,
             lift=np.zeros(len(p.own) if self.hilly and not p.sampled else 0),
-            pace=np.zeros((len(self.masses) if guided else 0, 3)),
-            since=0.0,
         )
 
     def initial(self) -> State:
@@ -183,16 +182,17 @@ class Units:
             work=integrate.scratch(p.own, state.estimate, len(self.masses), p.observer.CORRECTIONS, self.law.MESSAGE),
             heard=np.zeros((len(links.sender), self.law.MESSAGE)), sent_at=0.0, counted=-1,
         )  # fmt: skip
-        loop, air = self._loop(constants, now, self.orders), self._air(now)
+        loop, air = self._loop(constants, now), self._air(now)
+        references = References.one(p.reference, len(self.masses))
         self.parts = integrate.compiled(
             self.law, p.observer, p.plant,
-            (loop, p.consists.first, p.consists.length, links, p.reference, air, 0.0, self.h, 1, self.breaks, p.own, now.estimate,
+            (loop, p.consists.first, p.consists.length, links, references, air, 0.0, self.h, 1, self.breaks, p.own, now.estimate,
              now.work, now.extremes),
         )  # fmt: skip
         return now
 
-    def _loop(self, constants: Any, state: State, orders: integrate.Orders) -> integrate.Loop:
-        return integrate.Loop(self.told if self.p.sampled else constants, state.observer, self.plant, orders)
+    def _loop(self, constants: Any, state: State) -> integrate.Loop:
+        return integrate.Loop(self.told if self.p.sampled else constants, state.observer, self.plant, self.orders)
 
     def _air(self, state: State) -> integrate.Air:
         return integrate.Air(state.heard, self.period is None, self.law.ORDER == "chain", state.sent_at)
@@ -213,13 +213,8 @@ class Units:
                 held.acceleration[:] = told
         if len(self.orders.lift):
             self.orders.lift[:] = p.consists.mass * self._climbing(own)
-        orders = self.orders
-        if len(orders.pace):
-            assert formed.pace is not None
-            orders.pace[:] = np.stack(formed.pace).T
-            orders = orders._replace(since=t)
         self._disturb(disturbed)
-        loop, air, links = self._loop(formed.constants, state, orders), self._air(state), formed.links
+        loop, air, links = self._loop(formed.constants, state), self._air(state), formed.links
         assert links is not None
         moved = own.copy()
         moved[:, SPEED] += np.repeat(disturbed.speed, np.diff(first))
@@ -227,18 +222,20 @@ class Units:
         demanded = None
         for begin, sub_steps in self._pieces(t):
             if self.period is not None and (number := math.floor(begin / self.period + 1e-6)) != counted:
-                messages, air = self._exchange(loop, air, begin, number, counted < 0, moved, links, messages, state)
+                messages, air = self._exchange(
+                    loop, formed.references, air, begin, number, counted < 0, moved, links, messages, state
+                )
                 counted = number
             self._make_noise(begin, calm)
             applied = integrate.advance(
-                self.parts, loop, first, p.consists.length, links, p.reference, air, begin, self.h, sub_steps, self.breaks, moved,
-                state.estimate, state.work, state.extremes,
+                self.parts, loop, first, p.consists.length, links, formed.references, air, begin, self.h, sub_steps, self.breaks,
+                moved, state.estimate, state.work, state.extremes,
             )  # fmt: skip
             demanded = applied if demanded is None else demanded
         assert demanded is not None
         extras = self._extras(t, own, estimate, demanded, loop)
         force = own[:, FORCE].copy() if p.plant.STATES > FORCE else demanded
-        displacement = moved[heads, POSITION] - own[heads, POSITION] + np.where(own[heads, SPEED] > 0.0, disturbed.position, 0.0)
+        displacement = moved[heads, POSITION] - own[heads, POSITION] + disturbed.position
         clipped = displacement < 0.0
         displacement[clipped] = 0.0
         shift = np.repeat(own[heads, POSITION] + displacement - moved[heads, POSITION], np.diff(first))
@@ -316,8 +313,8 @@ class Units:
         return [(t + a * self.h, b - a) for a, b in pairwise([*starts, self.sub_steps])]
 
     def _exchange(
-        self, loop: integrate.Loop, air: integrate.Air, t: float, number: int, first_time: bool, own: Floats, links: Links,
-        messages: Messages, state: State,
+        self, loop: integrate.Loop, references: References, air: integrate.Air, t: float, number: int, first_time: bool,
+        own: Floats, links: Links, messages: Messages, state: State,
     ) -> tuple[Messages, integrate.Air]:  # fmt: skip
         """Send and hear at ``t``. A link opens with a message that arrives.
 
@@ -325,7 +322,7 @@ class Units:
         """
         first, sent = self.p.consists.first, state.work.sent
         live = air._replace(live=True) if first_time else air
-        integrate.exchange(self.parts, loop, first, links, self.p.reference, live, t, own, state.estimate, state.work)
+        integrate.exchange(self.parts, loop, first, links, references, live, t, own, state.estimate, state.work)
         messages, _ = exchange.deliver(self.radio, messages, sent.copy(), own[self.p.heads, POSITION], links, number)
         fresh = ~messages.ever
         messages.heard[fresh] = sent[links.sender[fresh]]
