@@ -180,7 +180,7 @@ class Loop(Steps):
         start = Start(
             ids=p.scenario.ids, edge=p.roster.edge, lane_position=p.roster.lane_position, speed=speed,
             length=p.consists.train_length(), unit_length=[p.consists.length[a:b] for a, b in pairwise(first)],
-            routes=p.roster.routes, present=s.traffic.came.copy(), vclass=p.roster.vclass,
+            routes=p.roster.routes, present=s.traffic.came.copy(), vclass=p.roster.vclass, arrival=p.roster.arrival,
         )  # fmt: skip
         if due := self.traffic.due(0.0, s.traffic):
             ways = lay_out(p.line, start)

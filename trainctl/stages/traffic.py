@@ -95,6 +95,8 @@ class Traffic:
         s = self.arrivals(t, seen, s)
         if not self.looks:
             return s, nothing(len(speed))
+        for i in np.flatnonzero(~s.came & self._given_up(t) & ~self._given_up(t - self.step_s)).tolist():
+            self.journal.event(t, "given_up", train=self.p.scenario.ids[i], planned_s=float(self.roster.depart[i]))
         s, stops, soon = self._stops(t, seen, speed, overrun, s)
         s, held, entries, kept_out = self.entering(t, ways, seen, speed, s, [] if last else self.due(t, s))
         present = seen.present.copy()
@@ -118,9 +120,14 @@ class Traffic:
         if s.came.all():
             return []
         first: dict[int, int] = {}
-        for i in np.flatnonzero(~s.came & (self.roster.depart <= t + 1e-9)).tolist():
+        for i in np.flatnonzero(~s.came & (self.roster.depart <= t + 1e-9) & ~self._given_up(t)).tolist():
             first.setdefault(int(self.roster.edge[i]), i)
         return sorted(first.values(), key=lambda i: (self.roster.depart[i], i))
+
+    def _given_up(self, t: float) -> Bools:
+        """Trains that would not come any more if they had not yet."""
+        late: Bools = t > self.roster.depart + self.roster.patience + 1e-9
+        return late
 
     def missing(self, t: float, s: State) -> list[str]:
         """Trains that were due and never came."""
@@ -140,7 +147,7 @@ class Traffic:
                 continue
             present[i] = True
             view = self._look(ways, here._replace(present=present), speed, held, s)
-            v = self._entering_speed(i, speed, view, s)
+            v = self._entering_speed(i, ways, here, speed, view, s)
             present[i] = v is not None
             if v is None:
                 kept_out[i] = waiting.kept_out(view, i)
@@ -151,15 +158,19 @@ class Traffic:
             come.append((i, v))
         return s._replace(came=came), held, tuple(come), kept_out
 
-    def _entering_speed(self, i: int, speed: Floats, view: View, s: State) -> float | None:
+    def _entering_speed(self, i: int, ways: Ways, here: Seen, speed: Floats, view: View, s: State) -> float | None:
         """Speed with which a train can enter safely; None if it has to wait. ``view`` is that with the train at its place."""
         rules, v, roster = self.rules, self.roster.speed[i], self.roster
         limit = float(roster.speed_factor[i] * self.p.rails.speed_mps[roster.edge[i]])
         on_edge = limit - self.p.driving.below_limit_mps
         wanted = float(min(self.p.cruise[i], max(on_edge, 0.0)) if np.isnan(v) else min(v, limit))
+        there = np.flatnonzero(here.present & (here.edge == roster.edge[i]) & (np.arange(len(speed)) != i))
+        if roster.like[i] and np.isnan(v) and len(there):
+            depth = here.position[there] - ways.begin[here.row[there]]
+            wanted = min(wanted, float(speed[there].mean() if roster.like[i] == "avg" else speed[there[np.argmin(depth)]]))
         if (stop := self.stop_of(i, s)) is not None:  # it must be able to stop there
             place = stop.place - float(self.p.rails.start_m[roster.edge[i]]) - float(roster.lane_position[i])
-            room = np.array([place - wanted * self.step_s])
+            room = np.array([place + self._further(stop, i) - wanted * self.step_s])
             planned = float(min(rules.service_mps2, self.assumed.braking[i]))
             wanted = min(wanted, float(supervisor.greatest_speed(room, planned, self.step_s, self.theta)[0]))
         ahead = authority.of(view.targets, view.targets.train == i)
@@ -192,6 +203,11 @@ class Traffic:
         stops, k = self.roster.stops[i], int(s.next_stop[i])
         return stops[k] if k < len(stops) else None
 
+    def _further(self, stop: Stop, i: int) -> float:
+        """How far behind a stop a train would come to a stand that passes it as fast as it may [m]; 0 if it is to stand there."""
+        rate = np.minimum(self.rules.service_mps2, self.assumed.braking[i])
+        return float(supervisor.stopping_distance(np.array([stop.passing]), rate, self.step_s, self.theta)[0])
+
     def _stops(self, t: float, seen: Seen, speed: Floats, overrun: Floats, s: State) -> tuple[State, tuple[Ints, Floats], Bools]:
         """Arrive at and leave stops; the trains that have one ahead and the room to it [m], and who stops soon."""
         trains, rooms, n = [], [], len(speed)
@@ -214,12 +230,20 @@ class Traffic:
                     s.stopping[i] = False
                     continue
                 room = stop.place - float(seen.position[i])
-            if speed[i] < STANDS_MPS and room < STOP_BAND_M:
+            while stop is not None and stop.passing and room <= 0.0:
+                self.journal.event(t, "waypoint", train=self.p.scenario.ids[i], stop=stop.name, speed_mps=float(speed[i]))
+                s.next_stop[i] += 1
+                stop = self.stop_of(i, s)
+                room = stop.place - float(seen.position[i]) if stop is not None else np.inf
+            if stop is None:
+                s.stopping[i] = False
+                continue
+            if not stop.passing and speed[i] < STANDS_MPS and room < STOP_BAND_M:
                 s.stands_until[i] = max(t + stop.duration, stop.until)
                 self.journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=room)
                 continue
             trains.append(i)
-            rooms.append(max(room - float(overrun[i]), 0.0))
+            rooms.append(max(room - float(overrun[i]), 0.0) + self._further(stop, i))
         found, room_to = np.array(trains, np.int64), np.array(rooms)
         rate = np.minimum(self.rules.service_mps2, self.assumed.braking[found])
         braking = supervisor.stopping_distance(speed[found], rate, self.step_s, self.theta)
