@@ -161,6 +161,8 @@ def judge(
 
 def measured(targets: Targets, limits: Limits, error: Floats) -> tuple[Targets, Limits]:
     """What trains are told whose positions are measured with an ``error`` (n,), measured minus true position [m]."""
+    if not error.any():
+        return targets, limits
     other = np.where(targets.other >= 0, error[targets.other], 0.0)
     ways = np.where(targets.kind == OPPOSING, -other, other)  # the front of one that comes: an error of its own way
     room = targets.room + ways - error[targets.train]

@@ -281,13 +281,16 @@ def _braking(params: Params, relied: Assumed, speed: Floats, now: Floats, target
     more = relied.drift + relied.surge + relied.lag * np.maximum(now + relied.braking, 0.0)
     v, b = speed[i] + np.where(stop, relied.drift[i], more[i]), relied.braking[i]  # the room to a stop counts the lag already
     own = stopping_distance(v, b, step, theta)
-    known = j >= 0
-    margin = params.margin_m + relied.uncertainty[i] + np.where(known, relied.uncertainty[j], 0.0)
+    margin: Floats | float = params.margin_m
+    if relied.uncertainty.any():
+        margin = margin + relied.uncertainty[i] + np.where(j >= 0, relied.uncertainty[j], 0.0)
     room = np.minimum(targets.room, _FAR) - np.where(stop, 0.0, margin)
     follows = a_train & targets.moving & (params.curve == "relative")
     away = stopping_distance(np.maximum(targets.speed - relied.blur, 0.0), relied.hardest[j], step, theta)
-    comes = stopping_distance(targets.speed + np.where(known, more[j], 0.0), relied.braking[j], step, theta)
-    to_stop = np.where(follows, room + away, np.where(opposing & targets.moving, 0.5 * (room + own - comes), room))
+    to_stop = np.where(follows, room + away, room)
+    if (meets := opposing & targets.moving).any():
+        comes = stopping_distance(targets.speed + np.where(j >= 0, more[j], 0.0), relied.braking[j], step, theta)
+        to_stop = np.where(meets, 0.5 * (room + own - comes), to_stop)
     return _Braking(room, to_stop, v, own)
 
 

@@ -60,7 +60,8 @@ class Protect:
         if view is None or self.rules.mode == "off":
             return over_the_step(driven.ordered, disturbed, state, False), acting
         verdict = self._verdict(view, own[self.p.heads, SPEED], acceleration, swing, disturbed.measurement)
-        moved = over_the_step(driven.ordered, disturbed.calm(), plant.copied(state), True)
+        calm = disturbed.calm() if self.disturbing else disturbed
+        moved = over_the_step(driven.ordered, calm, plant.copied(state), True)
         within, acts = applied(verdict, moved.motion.asked)
         acts &= ~stands
         acts_on = self.rules.mode == "on" and bool(acts.any())

@@ -95,13 +95,14 @@ class Traffic:
         s = self.arrivals(t, seen, s)
         if not self.looks:
             return s, nothing(len(speed))
-        for i in np.flatnonzero(~s.came & self._given_up(t) & ~self._given_up(t - self.step_s)).tolist():
+        for i in [] if s.came.all() else np.flatnonzero(~s.came & self._given_up(t) & ~self._given_up(t - self.step_s)).tolist():
             self.journal.event(t, "given_up", train=self.p.scenario.ids[i], planned_s=float(self.roster.depart[i]))
         s, stops, soon = self._stops(t, seen, speed, overrun, s)
-        s, held, entries, kept_out = self.entering(t, ways, seen, speed, s, [] if last else self.due(t, s))
+        reach = self._reach(speed)
+        s, held, entries, kept_out = self.entering(t, ways, seen, speed, s, [] if last else self.due(t, s), reach)
         present = seen.present.copy()
         present[[i for i, _ in entries]] = True
-        view = self._look(ways, seen._replace(present=present), speed, held, s)
+        view = self._look(ways, seen._replace(present=present), speed, held, s, self._reach(speed) if entries else reach)
         return s, Around(entries, stops, soon, held, kept_out, view)
 
     # Arrivals and entries
@@ -135,18 +136,18 @@ class Traffic:
         return [self.p.scenario.ids[i] for i in late]
 
     def entering(
-        self, t: float, ways: Ways, here: Seen, speed: Floats, s: State, due: Sequence[int]
+        self, t: float, ways: Ways, here: Seen, speed: Floats, s: State, due: Sequence[int], reach: Floats | None = None
     ) -> tuple[State, Held, tuple[tuple[int, float], ...], dict[int, int]]:
         """Trains of those that are ``due`` whose place is clear, with the speed they come with [m/s]; who keeps out the others."""
         asking = np.zeros(len(speed), bool)
         asking[due] = True
-        s, held = self._claim(t, ways, here, speed, asking, s)
+        s, held = self._claim(t, ways, here, self._reach(speed) if reach is None else reach, asking, s)
         present, came, come, kept_out = here.present.copy(), s.came.copy(), [], {}
         for i in due:
             if held.room[i] <= 0.0:
                 continue
             present[i] = True
-            view = self._look(ways, here._replace(present=present), speed, held, s)
+            view = self._look(ways, here._replace(present=present), speed, held, s, self._reach(speed))
             v = self._entering_speed(i, ways, here, speed, view, s)
             present[i] = v is not None
             if v is None:
@@ -262,12 +263,12 @@ class Traffic:
         braking = supervisor.stopping_distance(v, self.claiming, self.step_s, self.theta)
         return braking + 4.0 * v * self.step_s + rules.margin_m + 2.0 * DRIVER_MARGIN_M + 50.0 + 6.0 * assumed.uncertainty
 
-    def _claim(self, t: float, ways: Ways, seen: Seen, speed: Floats, entering: Bools, s: State) -> tuple[State, Held]:
+    def _claim(self, t: float, ways: Ways, seen: Seen, reach: Floats, entering: Bools, s: State) -> tuple[State, Held]:
         """Let every train claim what lies within its reach; ``entering`` (n,) are those that ask to enter the net."""
         if self.ways is not ways:  # they changed
             self.ways, self.zones = ways, interlocking.zones(ways, self.net)
         claims, held, said = interlocking.claim(
-            self.zones, s.claims, seen.row, seen.position, self.length, seen.present, self._reach(speed),
+            self.zones, s.claims, seen.row, seen.position, self.length, seen.present, reach,
             self.p.supervision.margin_m + DRIVER_MARGIN_M, entering,
         )  # fmt: skip
         ids, edges = self.p.scenario.ids, self.p.rails.edges
@@ -281,9 +282,9 @@ class Traffic:
                 self.journal.event(t, "switch_granted", train=ids[one.train], edge=edges[one.zone])
         return s._replace(claims=claims, waits_for=held.by.copy()), held
 
-    def _look(self, ways: Ways, seen: Seen, speed: Floats, held: Held, s: State) -> View:
+    def _look(self, ways: Ways, seen: Seen, speed: Floats, held: Held, s: State, reach: Floats) -> View:
         """What is ahead of every train."""
-        horizon = float(np.max(self._reach(speed), where=seen.present, initial=0.0)) + 1000.0
+        horizon = float(np.max(reach, where=seen.present, initial=0.0)) + 1000.0
         if self.p.driven:
             horizon = max(horizon, self.p.driving.join_range_m)
         return authority.look(
