@@ -25,7 +25,8 @@ from trainctl import runner
 from trainctl.errors import InputError, TrainctlError
 from trainctl.loop import Loop
 from trainctl.numeric import Numeric
-from trainctl.scenario.build import Prepared, prepare
+from trainctl.scenario.build import prepare
+from trainctl.scenario.model import Prepared
 from trainctl.scenario.reading import examine
 
 LAWS = Path(__file__).parent / "laws"

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 
 #: Trains that touch do not overlap; rounding of positions that add up over a run [m].
 TOUCH_M = 1e-3

@@ -15,7 +15,8 @@ from trainctl.railway import supervisor
 from trainctl.railway.along import Ahead
 from trainctl.railway.authority import View
 from trainctl.railway.supervisor import Limits, Targets
-from trainctl.scenario.build import Prepared, open_scenario
+from trainctl.scenario.build import open_scenario
+from trainctl.scenario.model import Prepared
 from trainctl.signals import POSITION, SPEED, Bools, Floats, Formed, Seen
 from trainctl.stages.traffic import Around
 

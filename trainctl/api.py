@@ -282,11 +282,10 @@ class Simulation:
         Where trains come and go that is the reference of its formation; a train in none follows nobody but itself.
         """
         i, formed = self._number(train), self._loop.state.formed
-        if formed.pace is None:
-            return self.reference
         if not formed.led[i]:
             return float(self.position_m[i]), float(self.speed_mps[i])
-        return float(formed.pace.position[i] - formed.offset[i]), float(formed.pace.speed[i])
+        position, speed = formed.references.leader(self.time).reshape(4, -1)[:2, i if len(formed.references.breaks) > 1 else 0]
+        return float(position - formed.offset[i]), float(speed)
 
     def step(self, steps: int = 1) -> float:
         """Go on by so many steps; returns the time [s]."""

@@ -39,7 +39,8 @@ from trainctl.record.folder import (
 )  # fmt: skip
 from trainctl.runs.run import Run
 from trainctl.scenario import promise, roster
-from trainctl.scenario.build import Prepared, prepare
+from trainctl.scenario.build import prepare
+from trainctl.scenario.model import Prepared
 from trainctl.scenario.reading import examine
 from trainctl.stages.record import Journal
 from trainctl.steps import Steps
@@ -221,6 +222,8 @@ def _driven(
     try:
         with _stops() as stop:
             journal = Journal(partial, p, saved.values["recorder"] if saved else None)
+            for note in p.roster.notes if saved is None else ():
+                journal.event(0.0, "not_followed", what=note)
             if p.self_driven:
                 world = open_self_driven(p, partial)
                 simulation = Watched(p, world, journal)

@@ -108,23 +108,62 @@ class Reference(NamedTuple):
     position: Floats  # (K, P) m/s^p
 
 
+class Pace(NamedTuple):
+    """Where references are and how they move, shape (R,)."""
+
+    position: Floats  # m
+    speed: Floats  # m/s
+    acceleration: Floats  # m/s2
+
+
+class References(NamedTuple):
+    """References of R formations, each as in ``Reference``, and which of them every train follows."""
+
+    breaks: Floats  # (R, K + 1) s
+    position: Floats  # (R, K, P) m/s^p
+    of: Ints  # (n,)
+
+    @classmethod
+    def one(cls, reference: Reference, trains: int) -> References:
+        """One reference for all trains."""
+        return cls(reference.breaks[None], reference.position[None], np.zeros(trains, np.int64))
+
+    @property
+    def pace(self) -> Pace:
+        """Position, speed and acceleration at the beginning of the first pieces; the first two may be written to."""
+        first = self.position[:, 0]
+        return Pace(first[:, 0], first[:, 1], 2.0 * first[:, 2])
+
+    def leader(self, t: float) -> Floats:
+        """Position, speed, acceleration and jerk at ``t``: (4,) where all follow one reference, else of each train (4, n)."""
+        out = np.empty((len(self.breaks), 4))
+        for r in range(len(self.breaks)):
+            evaluate(self.breaks[r], self.position[r], t, t, out[r])
+        return out[0] if len(out) == 1 else np.ascontiguousarray(out[self.of].T)
+
+
 @njit(cache=True)
-def leader_at(reference: Reference, t: float, inside: float, out: Floats) -> None:
-    """Write position, speed, acceleration and jerk of the virtual leader at ``t`` into ``out`` (4,).
+def evaluate(breaks: Floats, position: Floats, t: float, inside: float, out: Floats) -> None:
+    """Write position, speed, acceleration and jerk of a piecewise polynomial at ``t`` into ``out`` (4,).
 
     ``inside`` is any time within the piece meant: at a break the two sides differ, and an integrator's step must see one.
     """
-    last = reference.position.shape[0] - 1
-    k = min(max(np.searchsorted(reference.breaks, inside, side="right") - 1, 0), last)
-    s = t - reference.breaks[k]
+    k = min(max(np.searchsorted(breaks, inside, side="right") - 1, 0), position.shape[0] - 1)
+    s = t - breaks[k]
     for d in range(4):
         value = 0.0
-        for p in range(reference.position.shape[1] - 1, d - 1, -1):
-            factor = reference.position[k, p]
+        for p in range(position.shape[1] - 1, d - 1, -1):
+            factor = position[k, p]
             for q in range(d):
                 factor *= p - q
             value = value * s + factor
         out[d] = value
+
+
+@njit(cache=True)
+def leader_at(reference: Reference, t: float, inside: float, out: Floats) -> None:
+    """Write position, speed, acceleration and jerk of the virtual leader at ``t`` into ``out`` (4,), see ``evaluate``."""
+    evaluate(reference.breaks, reference.position, t, inside, out)
 
 
 class Trains(NamedTuple):
@@ -392,6 +431,7 @@ class Start(NamedTuple):
     routes: Sequence[tuple[str, ...]]  # edge ids from the edge a train starts on, internal ones included
     present: Bools  # (n,) the others come later
     vclass: Sequence[str]  # SUMO's class of vehicle
+    arrival: Floats | None = None  # (n,) m, from the beginning of the last edge, where a train leaves; None, inf: at its end
 
 
 class Seen(NamedTuple):
@@ -471,14 +511,6 @@ class Messages(NamedTuple):
     ever: Bools  # (L,) it has brought something
 
 
-class Pace(NamedTuple):
-    """Reference of every train's own formation now, shape (n,)."""
-
-    position: Floats  # m
-    speed: Floats  # m/s
-    acceleration: Floats  # m/s2
-
-
 class Formed(NamedTuple):
     """Who drives with whom: the formations, their links and references, and what the law made of them."""
 
@@ -487,18 +519,9 @@ class Formed(NamedTuple):
     ahead: Ints  # (n,) train ahead in the formation, -1: none
     led: Bools  # (n,) the law drives it
     offset: Floats  # (n,) m, added to the position along the own route, so that spacings in a formation are right
-    pace: Pace | None  # references of the formations; None: all follow that of the scenario
+    references: References  # one for all trains, or one of each formation's own
     constants: Any  # of the law
     made_of: tuple[float, Floats, Links] | None  # time, own state and links that the constants were made of
-
-    def after(self, step: float, theta: float) -> Formed:
-        """A step later: the references have gone on."""
-        if self.pace is None:
-            return self
-        v, a = self.pace.speed, self.pace.acceleration
-        speed = v + a * step
-        way = ((1.0 - theta) * v + theta * speed) * step
-        return self._replace(pace=self.pace._replace(position=self.pace.position + way, speed=speed))
 
 
 class Row(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.stages.record import Journal, Record
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from trainctl.railway import supervisor
 from trainctl.railway.ways import Ways
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.signals import POWERS, Bools, Extremes, Floats, Ints, Links, Motion, Observed, Row
 from trainctl.stages import orders, record
 from trainctl.stages.effort import Effort

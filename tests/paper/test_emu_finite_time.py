@@ -22,7 +22,7 @@ from trainctl.claims.emu_finite_time import (
 from trainctl.controllers import emu_finite_time as law
 from trainctl.observers import none
 from trainctl.plants import coupled_units, integrate, shared
-from trainctl.signals import Extremes, Floats, Reference
+from trainctl.signals import Extremes, Floats, Reference, References
 
 
 @pytest.fixture(scope="module")
@@ -247,7 +247,7 @@ def test_a_hundred_trains_of_eight_run_faster_than_real_time(plant_under: str, t
     work = integrate.scratch(own, estimate, 100, 0, part.MESSAGE)
     extremes = Extremes.fresh(100, 800, len(part.WATCHED))
     arguments = (
-        loop, scene.consists.first, scene.consists.length, scene.links, scene.reference, air, 0.0, 0.01, 100, np.zeros(0), own,
+        loop, scene.consists.first, scene.consists.length, scene.links, References.one(scene.reference, len(scene.trains)), air, 0.0, 0.01, 100, np.zeros(0), own,
         estimate, work, extremes,
     )  # fmt: skip
     parts = integrate.compiled(part, none, coupled_units, arguments)

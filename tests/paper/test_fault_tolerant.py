@@ -25,7 +25,7 @@ from trainctl.controllers import fault_tolerant as law
 from trainctl.observers import asymptotic, intermediate
 from trainctl.plants import actuated_units as plant
 from trainctl.plants import integrate
-from trainctl.signals import Extremes
+from trainctl.signals import Extremes, References
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,22 @@ def small_steps(every: float, duration: float) -> tuple[Example, list[np.ndarray
     air = integrate.Air(np.zeros((2, law.MESSAGE)), True, True, 0.0)
     work, extremes = integrate.scratch(own, estimate, 3, 5, 4), Extremes.fresh(3, 9, 3)
     c, n = s.consists, round(every / 0.002)
-    arguments = (loop, c.first, c.length, s.links, s.reference, air, 0.0, 0.002, n, np.zeros(0), own, estimate, work, extremes)
+    arguments = (
+        loop,
+        c.first,
+        c.length,
+        s.links,
+        References.one(s.reference, len(s.trains)),
+        air,
+        0.0,
+        0.002,
+        n,
+        np.zeros(0),
+        own,
+        estimate,
+        work,
+        extremes,
+    )
     parts = integrate.compiled(law, asymptotic, plant, arguments)
     states, estimates = [own.copy()], [estimate.copy()]
     for k in range(round(duration / every)):
@@ -79,7 +94,7 @@ def small_steps(every: float, duration: float) -> tuple[Example, list[np.ndarray
             c.first,
             c.length,
             s.links,
-            s.reference,
+            References.one(s.reference, len(s.trains)),
             air,
             k * every,
             0.002,
@@ -202,7 +217,7 @@ def compared() -> dict[str, Example]:
     return {
         "asymptotic": Example().run(800.0),
         "none": Example(observer_params=asymptotic.Params(compensate=False)).run(800.0),
-        "intermediate": Example(observer=intermediate).run(800.0),
+        "intermediate": Example(observer="intermediate").run(800.0),
     }
 
 
@@ -215,7 +230,7 @@ def test_between_window_edges_the_asymptotic_observer_is_far_better(compared):
 
 def test_noise_turns_the_comparison_round():
     """The other direction: with the noise the asymptotic observer (one pole of -3, five times) ripples more than the intermediate."""
-    runs = {o.__name__: Example(observer=o, seed=1).run(600.0) for o in (asymptotic, intermediate)}
+    runs = {o: Example(observer=o, seed=1).run(600.0) for o in ("asymptotic", "intermediate")}
     asymptotic_, intermediate_ = runs.values()
     assert asymptotic_.inside and intermediate_.inside
     assert asymptotic_.ripple()[1] > 2.0 * intermediate_.ripple()[1]
@@ -254,7 +269,7 @@ def test_tables_of_the_comparison(seed, capsys):
         "asymptotic": Example(seed=seed), "none": Example(seed=seed, observer_params=asymptotic.Params(compensate=False)),
         **{
             f"intermediate L = ({a:g}, {b:g}), kappa = {k:g}": Example(
-                seed=seed, observer=intermediate, observer_params=intermediate.Params(L1_per_s=a, L2_per_s2=b, kappa_per_s=k)
+                seed=seed, observer="intermediate", observer_params=intermediate.Params(L1_per_s=a, L2_per_s2=b, kappa_per_s=k)
             )
             for a, b, k in ((6.0, 9.0, 50.0), (6.0, 9.0, 5.0), (20.0, 100.0, 50.0))
         },

@@ -17,7 +17,7 @@ from scenes import coupled_trains
 from trainctl.controllers import emu_finite_time as law
 from trainctl.observers import none
 from trainctl.plants import coupled_units, integrate, shared
-from trainctl.signals import POWERS, Extremes, Floats, Reference, Scene
+from trainctl.signals import POWERS, Extremes, Floats, Reference, References, Scene
 
 JUMP = 0.0137  # s, where the reference below changes its speed: within a sub-step
 
@@ -45,7 +45,7 @@ class Rig:
     def _arguments(self, t: float, h: float, n: int) -> tuple[Any, ...]:
         c = self.scene.consists
         return (
-            self.loop, c.first, c.length, self.scene.links, self.scene.reference, self.air, t, h, n, self.breaks, self.own,
+            self.loop, c.first, c.length, self.scene.links, References.one(self.scene.reference, len(self.scene.trains)), self.air, t, h, n, self.breaks, self.own,
             self.estimate, self.work, self.extremes,
         )  # fmt: skip
 
@@ -55,7 +55,16 @@ class Rig:
     def exchange(self, t: float) -> None:
         c = self.scene.consists
         integrate.exchange(
-            self.parts, self.loop, c.first, self.scene.links, self.scene.reference, self.air, t, self.own, self.estimate, self.work
+            self.parts,
+            self.loop,
+            c.first,
+            self.scene.links,
+            References.one(self.scene.reference, len(self.scene.trains)),
+            self.air,
+            t,
+            self.own,
+            self.estimate,
+            self.work,
         )
 
 

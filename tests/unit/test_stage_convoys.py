@@ -83,9 +83,9 @@ def test_what_a_step_was_given_stays_as_it_was(p):
     """State is a value."""
     pair = Pair(p)
     state, formed, own = pair.state, pair.formed, pair.own
-    before = [a.copy() for a in (*state, formed.ahead, formed.offset, *formed.pace, own)]
+    before = [a.copy() for a in (*state, formed.ahead, formed.offset, *formed.references.pace, own)]
     pair.step()
-    for a, b in zip(before, (*state, formed.ahead, formed.offset, *formed.pace, own), strict=True):
+    for a, b in zip(before, (*state, formed.ahead, formed.offset, *formed.references.pace, own), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
@@ -98,7 +98,7 @@ def test_a_formation_is_measured_along_one_way(p):
     heads = pair.own[p.heads, POSITION]
     assert heads[0] - heads[1] == pytest.approx(1200.0) and pair.formed.offset[1] == pytest.approx(-70_000.0)
     assert pair.seen.position[1] == heads[1] and pair.formed.offset[0] == 0.0
-    assert [part[1] for part in pair.formed.pace] == [part[0] for part in pair.formed.pace]  # one reference
+    assert [part[1] for part in pair.formed.references.pace] == [part[0] for part in pair.formed.references.pace]  # one reference
 
 
 @pytest.mark.parametrize("law", nets.LAWS)
@@ -160,7 +160,7 @@ def test_a_law_that_objects_is_asked_again_and_told_of_once(p, monkeypatch):
         (lambda pair: pair.traffic.stopping.__setitem__(0, True), "one of the two stops or waits"),
         (lambda pair: setattr(pair, "view", lambda: view([-1, 2, -1] + [-1] * (pair.rest - 1), [np.inf, 600.0] + [np.inf] * pair.rest)),
          "another train is ahead now"),
-        (lambda pair: pair.formed.pace.speed.__setitem__(slice(None), 32.0), "the reference falls below what the law can hold"),
+        (lambda pair: pair.formed.references.pace.speed.__setitem__(slice(None), 32.0), "the reference falls below what the law can hold"),
     ],
 )  # fmt: skip
 def test_why_trains_part_and_that_they_stay_apart_for_a_while(p, change, why):
@@ -184,5 +184,5 @@ def test_a_train_alone_is_its_own_reference(p):
     pair.formed = chained(pair.formed, [-1] * n)
     pair.view = lambda: view([-1] * n, [np.inf] * n)
     pair.step()
-    np.testing.assert_array_equal(pair.formed.pace.speed, 36.5)
-    np.testing.assert_array_equal(pair.formed.pace.position, pair.seen.position)
+    np.testing.assert_array_equal(pair.formed.references.pace.speed, 36.5)
+    np.testing.assert_array_equal(pair.formed.references.pace.position, pair.seen.position)

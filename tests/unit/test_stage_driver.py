@@ -9,8 +9,9 @@ from staged import Told, around, chained, prepared, target, view
 
 from trainctl.railway.supervisor import TRAIN, Limits
 from trainctl.scenario.build import open_scenario
+from trainctl.stages import driver
 from trainctl.stages.convoys import Convoys
-from trainctl.stages.driver import HASTE, ROOM_FOR_HASTE, Driver
+from trainctl.stages.driver import HASTE, ROOM_FOR_HASTE
 from trainctl.stages.traffic import Traffic, nothing
 from trainctl.topology.convoys import closing_speed
 
@@ -27,7 +28,7 @@ class Cab:
 
     def __init__(self, p, speed=35.0):
         self.p, self.n = p, len(p.scenario.ids)
-        self.driver, self.traffic = Driver(p), Traffic(p, Told()).initial()
+        self.driver, self.traffic = driver.of(p), Traffic(p, Told()).initial()
         self.formed = Convoys(p, Told()).initial()[1]
         self.v, self.nobody = np.full(self.n, speed), np.full(self.n, np.nan)
 
@@ -50,7 +51,7 @@ def test_trains_on_a_line_are_driven_by_their_law():
     p = open_scenario("three_tracks")
     n = len(p.scenario.ids)
     formed = object()
-    driven, same = Driver(p).step(np.full(n, 80.0), np.zeros(n), nothing(n), None, formed, np.full(n, 0.3))
+    driven, same = driver.of(p).step(np.full(n, 80.0), np.zeros(n), nothing(n), None, formed, np.full(n, 0.3))
     assert np.isnan(driven.ordered).all() and not driven.stands.any() and same is formed
 
 
@@ -82,12 +83,12 @@ def test_limits_stops_and_trains_ahead_are_braked_for(p):
 def test_the_reference_of_a_formation_heeds_limits_of_all_and_what_is_ahead_of_its_first(p):
     cab = Cab(p)
     cab.formed = chained(cab.formed, [-1, 0] + [-1] * (cab.n - 2))
-    cab.formed.pace.speed[:] = 35.0
+    cab.formed.references.pace.speed[:] = 35.0
     driven, formed = cab.step(cab.alone(limits=Limits(np.array([1]), np.array([0.0]), np.array([30.0]))))
     assert np.isnan(driven.ordered[:2]).all() and np.isfinite(driven.ordered[2:]).all()  # the law drives the two
-    assert formed.pace.acceleration[0] == formed.pace.acceleration[1] < -0.1
+    assert formed.references.pace.acceleration[0] == formed.references.pace.acceleration[1] < -0.1
     _, formed = cab.step(cab.alone(targets=target(1, 100.0, 35.0, TRAIN, moving=True, other=0)))  # the law looks after that
-    np.testing.assert_allclose(formed.pace.acceleration, 0.0)
+    np.testing.assert_allclose(formed.references.pace.acceleration, 0.0)
 
 
 def test_a_train_that_stands_at_a_stop_is_held_and_so_is_one_that_may_not_go(p):

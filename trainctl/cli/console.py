@@ -15,7 +15,7 @@ from trainctl.errors import InputError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from trainctl.scenario.build import Prepared
+    from trainctl.scenario.model import Prepared
 
 DEFAULT_SCENARIO = "three_tracks"
 

@@ -10,7 +10,7 @@ import numpy as np
 from trainctl.signals import POSITION, SPEED, Floats, Row
 
 if TYPE_CHECKING:
-    from trainctl.scenario.build import Prepared
+    from trainctl.scenario.model import Prepared
     from trainctl.signals import Row
 
 #: Signs of ``signals.POWERS`` in the balance.

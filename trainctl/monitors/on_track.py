@@ -19,7 +19,7 @@ from trainctl.railway.ways import Ways
 from trainctl.signals import Bools, Floats, Ints
 
 if TYPE_CHECKING:
-    from trainctl.scenario.build import Prepared
+    from trainctl.scenario.model import Prepared
     from trainctl.signals import Seen
 
 keep_by_sources()  # before anything below is decorated

@@ -23,7 +23,7 @@ from numba.extending import overload
 from trainctl.errors import LawError
 from trainctl.kernels import bare
 from trainctl.plants import shared
-from trainctl.signals import FORCE, POSITION, POWERS, SPEED, Bools, Extremes, Floats, Ints, Links, Reference, leader_at
+from trainctl.signals import FORCE, POSITION, POWERS, SPEED, Bools, Extremes, Floats, Ints, Links, References, evaluate
 
 types: Any = numba.types
 typeof: Any = numba.typeof
@@ -52,12 +52,10 @@ class Orders(NamedTuple):
 
     held: shared.Constants  # accelerations (n,) held instead of the law's demand; NaN leaves a train to its law
     lift: Floats  # (U,) N, what holds each unit on its slope: added to the law's demand
-    pace: Floats  # (n, 3) position [m], speed [m/s] and acceleration [m/s2] at ``since`` of each train's own reference
-    since: float  # s
 
 
 #: Nothing is ordered.
-NO_ORDERS = Orders(shared.NOBODY, np.zeros(0), np.zeros((0, 3)), 0.0)
+NO_ORDERS = Orders(shared.NOBODY, np.zeros(0))
 
 
 class Loop(NamedTuple):
@@ -107,14 +105,13 @@ def scratch(own: Floats, estimate: Floats, trains: int, corrections: int, messag
     )  # fmt: skip
 
 
-@bare()
-def lead(i, orders, t, leader):  # type: ignore[no-untyped-def]
-    """Let ``leader`` be that of train ``i``."""
-    pace, since = orders.pace, t - orders.since
-    leader[0] = pace[i, 0] + since * (pace[i, 1] + 0.5 * since * pace[i, 2])
-    leader[1] = pace[i, 1] + since * pace[i, 2]
-    leader[2] = pace[i, 2]
-    leader[3] = 0.0
+@bare(inline="always")
+def lead(i, before, references, t, inside, leader):  # type: ignore[no-untyped-def]
+    """Let ``leader`` be that of train ``i``; returns which reference that is. ``before``: the one it is of already."""
+    r = references.of[i]
+    if r != before:
+        evaluate(references.breaks[r], references.position[r], t, inside, leader)
+    return r
 
 
 @bare()
@@ -126,7 +123,7 @@ def add(lift, sign, a, b, applied):  # type: ignore[no-untyped-def]
 
 
 @bare(cache=False)
-def stage(code, loop, first, links, reference, air, t, inside, own, estimate, work, low, high):  # type: ignore[no-untyped-def]
+def stage(code, loop, first, links, references, air, t, inside, own, estimate, work, low, high):  # type: ignore[no-untyped-def]
     """Evaluate the closed loop of trains ``low`` to ``high`` at one instant: fills ``work`` with forces and rates.
 
     The weight along the track is known and made up for: it is added to what the law demands, within the limits. Observers, which
@@ -136,10 +133,10 @@ def stage(code, loop, first, links, reference, air, t, inside, own, estimate, wo
     correction, estimate_rate = part(code, OBSERVER, "correction"), part(code, OBSERVER, "rate")
     limit, rate = part(code, PLANT, "limit"), part(code, PLANT, "rate")
     observed = estimate.shape[1] > 0
-    leader_at(reference, t, inside, work.leader)
+    follows = -1  # whose reference ``work.leader`` is
     age = 0.0 if air.live else t - air.sent_at
     held, lift, talk = loop.orders.held.acceleration, loop.orders.lift, talking(air)
-    ordered, guided = len(held) > 0, len(loop.orders.pace) > 0
+    ordered = len(held) > 0
     for i in range(low, high):
         a, b = first[i], first[i + 1]
         if observed:
@@ -153,8 +150,7 @@ def stage(code, loop, first, links, reference, air, t, inside, own, estimate, wo
                     work.held[u] = own[u, SPEED] < 0.0 or (own[u, SPEED] == 0.0 and work.own_rate[u, SPEED] <= 0.0)
             correction(i, loop.observer, own[a:b], estimate[a:b], work.held[a:b], work.correction[a:b])
         if talk and not air.chain:
-            if guided:
-                lead(i, loop.orders, t, work.leader)
+            follows = lead(i, follows, references, t, inside, work.leader)
             message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
     for p in range(low, high):
         i = links.order[p] if talk else p
@@ -164,8 +160,7 @@ def stage(code, loop, first, links, reference, air, t, inside, own, estimate, wo
             for k in range(e, f):
                 for q in range(air.heard.shape[1]):
                     air.heard[k, q] = work.sent[links.sender[k], q]
-        if guided:
-            lead(i, loop.orders, t, work.leader)
+        follows = lead(i, follows, references, t, inside, work.leader)
         demand(
             i, loop.law, work.leader, age, links.slot[i], own[a:b], estimate[a:b], work.correction[a:b],
             links.desired[e:f], air.heard[e:f], work.applied[a:b],
@@ -191,21 +186,22 @@ def stage(code, loop, first, links, reference, air, t, inside, own, estimate, wo
 
 
 @bare()
-def exchange_kernel(code, loop, first, links, reference, air, t, own, estimate, work):  # type: ignore[no-untyped-def]
+def exchange_kernel(code, loop, first, links, references, air, t, own, estimate, work):  # type: ignore[no-untyped-def]
     """See ``exchange``."""
     message = part(code, LAW, "message")
-    stage(code, loop, first, links, reference, air, t, t, own, estimate, work, 0, len(first) - 1)
+    stage(code, loop, first, links, references, air, t, t, own, estimate, work, 0, len(first) - 1)
+    follows = -1
     for i in range(len(first) - 1):
         a, b = first[i], first[i + 1]
-        if len(loop.orders.pace) > 0:
-            lead(i, loop.orders, t, work.leader)
+        follows = lead(i, follows, references, t, t, work.leader)
         message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
 
 
 @bare(cache=False)
-def see(code, loop, first, length, links, t, own, work, extremes, low, high):  # type: ignore[no-untyped-def]
+def see(code, loop, first, length, links, references, t, inside, own, work, extremes, low, high):  # type: ignore[no-untyped-def]
     """Widen ``extremes`` of trains ``low`` to ``high`` by the state and the forces of this instant; what is NaN widens nothing."""
     watch = part(code, LAW, "watch")
+    follows = -1
     for i in range(low, high):
         a, b = first[i], first[i + 1]
         for u in range(a, b):
@@ -214,8 +210,7 @@ def see(code, loop, first, length, links, t, own, work, extremes, low, high):  #
             if u + 1 < b:
                 widen(extremes.coupler_min, extremes.coupler_max, u, own[u, 0] - own[u + 1, 0] - length[u])
         if extremes.watched.shape[1] > 0:
-            if len(loop.orders.pace) > 0:
-                lead(i, loop.orders, t, work.leader)
+            follows = lead(i, follows, references, t, inside, work.leader)
             watch(i, loop.law, work.leader, first, own, links, extremes.watched[i])
             for q in range(extremes.watched.shape[1]):
                 widen(extremes.watched_min[i], extremes.watched_max[i], q, extremes.watched[i, q])
@@ -253,19 +248,19 @@ def talking(air):  # type: ignore[no-untyped-def]
 
 
 @bare()
-def advance_kernel(code, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes):  # type: ignore[no-untyped-def]
+def advance_kernel(code, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes):  # type: ignore[no-untyped-def]
     """See ``advance``. Trains that do not hear each other meanwhile are taken a few at a time, so that they stay in the cache."""
     trains = len(first) - 1
     size = trains if talking(air) else TOGETHER
     for low in range(0, trains, max(size, 1)):
         stretch(
-            code, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes, low,
+            code, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes, low,
             min(low + size, trains),
         )  # fmt: skip
 
 
 @bare(cache=False)
-def stretch(code, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes, low, high):  # type: ignore[no-untyped-def]
+def stretch(code, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes, low, high):  # type: ignore[no-untyped-def]
     """Integrate trains ``low`` to ``high``."""
     a, b = first[low], first[high]
     x, q, energy, power = own[a:b], estimate[a:b], extremes.energy[low:high], work.power[low:high]
@@ -287,9 +282,11 @@ def stretch(code, loop, first, length, links, reference, air, t, h, n, breaks, o
                 if s > 0:
                     along(x, x_0, ahead, x_rate)
                     along(q, q_0, ahead, q_rate)
-                stage(code, loop, first, links, reference, air, begin + ahead, begin + 0.5 * dt, own, estimate, work, low, high)
+                stage(code, loop, first, links, references, air, begin + ahead, begin + 0.5 * dt, own, estimate, work, low, high)
                 if s == 0:
-                    see(code, loop, first, length, links, begin, own, work, extremes, low, high)
+                    see(
+                        code, loop, first, length, links, references, begin, begin + 0.5 * dt, own, work, extremes, low, high
+                    )  # fmt: skip
                     for i in range(low, high):
                         extremes.limited[i] += dt * work.limited[i]
                     if k == 0 and begin == t:
@@ -352,10 +349,10 @@ def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...]) ->
     code = described(law, observer, plant)
     if config.DISABLE_JIT:
         return Parts(code, advance_kernel, exchange_kernel)
-    loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes = (typeof(a) for a in arguments)
+    loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes = (typeof(a) for a in arguments)
     text = types.literal(code)
-    to_advance = (text, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes)
-    to_exchange = (text, loop, first, links, reference, air, t, own, estimate, work)
+    to_advance = (text, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes)
+    to_exchange = (text, loop, first, links, references, air, t, own, estimate, work)
     place = hashlib.sha256(" ".join(m.__file__ for m in (law, observer, plant)).encode()).hexdigest()[:16]
     return Parts(code, from_cache(advance_kernel, place, to_advance), from_cache(exchange_kernel, place, to_exchange))
 
@@ -375,8 +372,8 @@ def from_cache(kernel: Any, place: str, arguments: tuple[Any, ...]) -> Callable[
 
 
 def advance(
-    parts: Parts, loop: Loop, first: Ints, length: Floats, links: Links, reference: Reference, air: Air, t: float, h: float, n: int,
-    breaks: Floats, own: Floats, estimate: Floats, work: Scratch, extremes: Extremes,
+    parts: Parts, loop: Loop, first: Ints, length: Floats, links: Links, references: References, air: Air, t: float, h: float,
+    n: int, breaks: Floats, own: Floats, estimate: Floats, work: Scratch, extremes: Extremes,
 ) -> Floats:  # fmt: skip
     """Integrate ``own`` and ``estimate`` in place over ``n`` classic Runge-Kutta steps of ``h`` seconds from ``t``.
 
@@ -386,13 +383,13 @@ def advance(
     The arguments must be of the types ``compiled`` was given (a float stays a float): nothing is checked here, since numba's own
     check of so many arguments takes 0.4 ms.
     """
-    parts.advance(parts.code, loop, first, length, links, reference, air, t, h, n, breaks, own, estimate, work, extremes)
+    parts.advance(parts.code, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes)
     return work.applied_first.copy()
 
 
 def exchange(
-    parts: Parts, loop: Loop, first: Ints, links: Links, reference: Reference, air: Air, t: float, own: Floats, estimate: Floats,
+    parts: Parts, loop: Loop, first: Ints, links: Links, references: References, air: Air, t: float, own: Floats, estimate: Floats,
     work: Scratch,
 ) -> None:  # fmt: skip
     """Fill ``work.sent`` with what every train sends at ``t``, each from what it had heard until then."""
-    parts.exchange(parts.code, loop, first, links, reference, air, t, own, estimate, work)
+    parts.exchange(parts.code, loop, first, links, references, air, t, own, estimate, work)

@@ -214,7 +214,7 @@ def advance(constants: Constants, own: Floats, acceleration: Floats, step: float
     -----
     The order of (4): add w3, clamp the input, subtract the true resistance, add w2, clamp the speed. Departs from both papers
     in two things: the gradient, and standstill. Trains on a network do not run backwards, so neither a speed nor a displacement
-    falls below 0, and a train that stands is not moved by a disturbance of its position: its brakes hold it.
+    falls below 0.
     """
     moved = Moved(np.empty_like(own), *np.empty((2, len(own))), *np.empty((2, len(own)), dtype=bool))
     climb = climbing(own[:, POSITION], constants.gradient) + GRAVITY * constants.slope
@@ -234,7 +234,7 @@ def _advance(constants: Constants, own: Floats, climb: Floats, acceleration: Flo
         free = v + applied * step - (c.resistance_factor[i] * believed + climb[i]) * step + kick.speed[i]
         v_next = np.minimum(np.maximum(np.maximum(free, c.speed_lower[i]), 0.0), c.speed_upper[i])
         distance = v * step + kick.position[i]
-        displacement = np.maximum(distance, 0.0) if v > 0.0 else 0.0 * v  # what is not a number stays that
+        displacement = np.maximum(distance, 0.0)
         moved.own[i, POSITION], moved.own[i, SPEED] = own[i, POSITION] + displacement, v_next
         moved.input[i], moved.displacement[i] = applied, displacement
         moved.limited[i] = applied != asked or v_next != free

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from trainctl.errors import InputError, SimulatorError
 from trainctl.railway.ways import Ways
 from trainctl.record.folder import FORMAT, installed
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.signals import Floats, Ints, Links, Seen, Start
 from trainctl.world import World
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from trainctl.plants import shared
 from trainctl.scenario import limits, promise
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.topology import graph
 
 #: More trains than this are counted, not named.

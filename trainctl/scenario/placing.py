@@ -17,7 +17,7 @@ from trainctl.signals import GRAVITY, Consists, Ints
 from trainctl.topology import graph
 
 if TYPE_CHECKING:
-    from trainctl.scenario.build import Prepared
+    from trainctl.scenario.model import Prepared
 
 
 def places(scenario: Scenario) -> Ints:

@@ -24,7 +24,7 @@ from trainctl.railway.ways import ways
 from trainctl.signals import GRAVITY, POSITION, SPEED, Floats
 
 if TYPE_CHECKING:
-    from trainctl.scenario.build import Prepared
+    from trainctl.scenario.model import Prepared
 
 #: What has no bound is counted as this many standard deviations: exceeded once in 5e8 draws.
 DEVIATIONS = 6.0

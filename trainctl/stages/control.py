@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from trainctl.errors import LawError
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.signals import POSITION, SPEED, Demand, Disturbed, Floats, Formed, Messages, Trains
 from trainctl.topology import exchange
 
@@ -66,7 +66,7 @@ class Control:
     ) -> tuple[Demand, Formed, Messages, Any]:  # fmt: skip
         assert formed.links is not None
         p, law, heads = self.p, self.p.law, own[self.p.heads]
-        leader = p.leader(t) if formed.pace is None else np.stack([*formed.pace, np.zeros(len(heads))])
+        leader = formed.references.leader(t)
         trains = Trains(heads[:, POSITION] + disturbed.measurement, heads[:, SPEED], resistance)
         sent = law.message(formed.constants, trains, leader)
         number = k // p.scenario.run.held_steps

@@ -9,7 +9,7 @@ import numpy as np
 from trainctl.railway import authority, supervisor
 from trainctl.railway.authority import View
 from trainctl.railway.supervisor import STOP
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.signals import Bools, Floats, Formed
 from trainctl.stages.traffic import Around
 from trainctl.stages.traffic import State as Traffic
@@ -33,6 +33,21 @@ class Driven(NamedTuple):
 
     ordered: Floats  # (n,) m/s2, NaN: the law drives
     stands: Bools  # (n,) the train is held where it is
+
+
+def of(p: Prepared) -> Nobody | Driver:
+    """The driver of a scenario's trains."""
+    return Driver(p) if p.driven else Nobody()
+
+
+class Nobody:
+    """The law leads every train."""
+
+    def step(
+        self, speed: Floats, acceleration: Floats, around: Around, traffic: Traffic, formed: Formed, commanded: Floats
+    ) -> tuple[Driven, Formed]:
+        """No orders; see ``Driver.step``."""
+        return Driven(np.full(len(speed), np.nan), np.zeros(len(speed), bool)), formed
 
 
 class Driver:
@@ -68,13 +83,11 @@ class Driver:
         tuple of Driven and Formed
             The latter with the accelerations of its references.
         """
-        if self.p.placed:  # the law drives everybody
-            return Driven(np.full(self.n, np.nan), np.zeros(self.n, bool)), formed
-        view, pace, led = around.view, formed.pace, formed.led
-        assert view is not None and pace is not None
+        view, references, led = around.view, formed.references, formed.led
+        assert view is not None
         front = convoys.fronts(formed.ahead)
         first = front == np.arange(self.n)
-        v = np.maximum(np.where(led, pace.speed, speed), 0.0)
+        v = np.maximum(np.where(led, references.pace.speed, speed), 0.0)
         limits = view.limits._replace(speed=self.p.driving.below(view.limits.speed))
         judged = self.step_s, self.theta, self.assumed, acceleration
         by_limits = supervisor.verdict(self.rules, v, supervisor.no_targets(), limits, *judged).greatest
@@ -88,7 +101,8 @@ class Driver:
         rate = np.maximum(np.minimum(rate, self.p.driving.acceleration_mps2), -v / self.step_s)[front]
         rate = np.where(traffic.standing, 0.0, rate)
         halted = ~led & (np.abs(speed) < HELD_MPS) & (rate <= 0.0)
-        formed = formed._replace(pace=pace._replace(acceleration=np.where(led, rate, 0.0)))
+        ordered_pace = references.pace._replace(acceleration=np.where(led, rate, 0.0))
+        formed = formed._replace(references=convoys.references(ordered_pace, float(references.breaks[0, 0])))
         outside = ~np.isnan(commanded)
         ordered = np.where(led, np.nan, np.where(outside, commanded, rate))
         return Driven(ordered, traffic.standing | (halted & ~(outside & (commanded > 0.0)))), formed

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from trainctl.plants import point
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.signals import GRAVITY, POWERS, Floats, Motion, Observed
 
 

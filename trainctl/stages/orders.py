@@ -15,7 +15,7 @@ from sumo_net.line import LineCrossover
 from trainctl.errors import InputError
 from trainctl.railway import supervisor
 from trainctl.railway.ways import Ways
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.scenario.tables import Event
 from trainctl.signals import Floats, Ints, Seen
 from trainctl.stages.record import Journal

@@ -10,7 +10,7 @@ import numpy as np
 
 from trainctl.davis import resistance
 from trainctl.plants import coupled_units, faults, integrate, point, shared
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.signals import (
     FORCE,
     GRAVITY,
@@ -25,6 +25,7 @@ from trainctl.signals import (
     Messages,
     Motion,
     PointPlant,
+    References,
     Scene,
     UnitPlant,
 )  # fmt: skip
@@ -104,6 +105,10 @@ class Points:
         """Nothing acts late here, so it does not matter."""
         return np.zeros(len(own))
 
+    def swing(self, own: Floats) -> Floats:
+        """A point has no couplers."""
+        return np.zeros(len(own))
+
     def overrun(self, own: Floats, braking: float) -> Floats:
         """Nothing acts late here."""
         return np.zeros(len(own))
@@ -144,16 +149,13 @@ class Units:
         )
         self.masses = p.consists.train_mass()
         self.lag = p.assumed.lag
-        guided = not p.placed
-        self.hilly = bool(len(self.gradient)) or (guided and bool(p.rails.slope.any()))
-        ordered = guided or p.supervision.mode != "off"
+        self.hilly = bool(len(self.gradient)) or bool(p.net_slope.any())
+        ordered = p.looks_ahead
         # Written anew in every step before they are read, like the columns of the plant's table that disturb it.
         self.told = shared.constants(p.plant_params, p.consists, self.gradient) if p.sampled else shared.NOBODY
         self.orders = integrate.Orders(
             held=shared.constants(p.plant_params, p.consists, self.gradient) if ordered and not p.sampled else shared.NOBODY,
             lift=np.zeros(len(p.own) if self.hilly and not p.sampled else 0),
-            pace=np.zeros((len(self.masses) if guided else 0, 3)),
-            since=0.0,
         )
 
     def initial(self) -> State:
@@ -183,16 +185,17 @@ class Units:
             work=integrate.scratch(p.own, state.estimate, len(self.masses), p.observer.CORRECTIONS, self.law.MESSAGE),
             heard=np.zeros((len(links.sender), self.law.MESSAGE)), sent_at=0.0, counted=-1,
         )  # fmt: skip
-        loop, air = self._loop(constants, now, self.orders), self._air(now)
+        loop, air = self._loop(constants, now), self._air(now)
+        references = References.one(p.reference, len(self.masses))
         self.parts = integrate.compiled(
             self.law, p.observer, p.plant,
-            (loop, p.consists.first, p.consists.length, links, p.reference, air, 0.0, self.h, 1, self.breaks, p.own, now.estimate,
+            (loop, p.consists.first, p.consists.length, links, references, air, 0.0, self.h, 1, self.breaks, p.own, now.estimate,
              now.work, now.extremes),
         )  # fmt: skip
         return now
 
-    def _loop(self, constants: Any, state: State, orders: integrate.Orders) -> integrate.Loop:
-        return integrate.Loop(self.told if self.p.sampled else constants, state.observer, self.plant, orders)
+    def _loop(self, constants: Any, state: State) -> integrate.Loop:
+        return integrate.Loop(self.told if self.p.sampled else constants, state.observer, self.plant, self.orders)
 
     def _air(self, state: State) -> integrate.Air:
         return integrate.Air(state.heard, self.period is None, self.law.ORDER == "chain", state.sent_at)
@@ -213,13 +216,8 @@ class Units:
                 held.acceleration[:] = told
         if len(self.orders.lift):
             self.orders.lift[:] = p.consists.mass * self._climbing(own)
-        orders = self.orders
-        if len(orders.pace):
-            assert formed.pace is not None
-            orders.pace[:] = np.stack(formed.pace).T
-            orders = orders._replace(since=t)
         self._disturb(disturbed)
-        loop, air, links = self._loop(formed.constants, state, orders), self._air(state), formed.links
+        loop, air, links = self._loop(formed.constants, state), self._air(state), formed.links
         assert links is not None
         moved = own.copy()
         moved[:, SPEED] += np.repeat(disturbed.speed, np.diff(first))
@@ -227,18 +225,20 @@ class Units:
         demanded = None
         for begin, sub_steps in self._pieces(t):
             if self.period is not None and (number := math.floor(begin / self.period + 1e-6)) != counted:
-                messages, air = self._exchange(loop, air, begin, number, counted < 0, moved, links, messages, state)
+                messages, air = self._exchange(
+                    loop, formed.references, air, begin, number, counted < 0, moved, links, messages, state
+                )
                 counted = number
             self._make_noise(begin, calm)
             applied = integrate.advance(
-                self.parts, loop, first, p.consists.length, links, p.reference, air, begin, self.h, sub_steps, self.breaks, moved,
-                state.estimate, state.work, state.extremes,
+                self.parts, loop, first, p.consists.length, links, formed.references, air, begin, self.h, sub_steps, self.breaks,
+                moved, state.estimate, state.work, state.extremes,
             )  # fmt: skip
             demanded = applied if demanded is None else demanded
         assert demanded is not None
         extras = self._extras(t, own, estimate, demanded, loop)
         force = own[:, FORCE].copy() if p.plant.STATES > FORCE else demanded
-        displacement = moved[heads, POSITION] - own[heads, POSITION] + np.where(own[heads, SPEED] > 0.0, disturbed.position, 0.0)
+        displacement = moved[heads, POSITION] - own[heads, POSITION] + disturbed.position
         clipped = displacement < 0.0
         displacement[clipped] = 0.0
         shift = np.repeat(own[heads, POSITION] + displacement - moved[heads, POSITION], np.diff(first))
@@ -259,6 +259,7 @@ class Units:
         """
         heads = self.p.heads
         v, after = own[heads, SPEED], moved[heads, SPEED]
+        mean = np.where(after > 0.0, mean + (self.swing(moved) - self.swing(own)) / self.step_s, mean)
         if self.p.plant.STATES > FORCE:
             gained = self.lag * (np.maximum(self.acceleration(moved), 0.0) - np.maximum(self.acceleration(own), 0.0)) / self.step_s
             return np.where(after > 0.0, mean + gained, mean)
@@ -281,6 +282,18 @@ class Units:
         force = np.add.reduceat(own[:, FORCE], heads) - self.masses * self.believed_resistance(own)
         found: Floats = force / np.add.reduceat(c.mass * c.rotating, heads)
         return np.where(own[heads, SPEED] > 0.0, found, np.maximum(found, 0.0))
+
+    def swing(self, own: Floats) -> Floats:
+        """By how much couplers, and units against each other, may still speed up every head [m/s], (n,): all of their energy."""
+        c, v = self.p.consists, own[:, SPEED]
+        units = np.diff(c.first)
+        mean = np.add.reduceat(c.mass * v, c.first[:-1]) / self.masses
+        energy = c.mass * (v - np.repeat(mean, units)) ** 2
+        stretch = own[:-1, POSITION] - own[1:, POSITION] - c.length[:-1]
+        energy[:-1] += c.stiffness[:-1] * stretch**2  # 0 behind the last unit
+        fastest = mean + np.sqrt(np.add.reduceat(energy, c.first[:-1]) / np.minimum.reduceat(c.mass, c.first[:-1]))
+        more: Floats = np.maximum(fastest - v[self.p.heads], 0.0)
+        return more
 
     def overrun(self, own: Floats, braking: float) -> Floats:
         """How much farther every train comes to a stand than by ``braking`` [m/s2] from now on, as actuators act late [m], (n,).
@@ -316,8 +329,8 @@ class Units:
         return [(t + a * self.h, b - a) for a, b in pairwise([*starts, self.sub_steps])]
 
     def _exchange(
-        self, loop: integrate.Loop, air: integrate.Air, t: float, number: int, first_time: bool, own: Floats, links: Links,
-        messages: Messages, state: State,
+        self, loop: integrate.Loop, references: References, air: integrate.Air, t: float, number: int, first_time: bool,
+        own: Floats, links: Links, messages: Messages, state: State,
     ) -> tuple[Messages, integrate.Air]:  # fmt: skip
         """Send and hear at ``t``. A link opens with a message that arrives.
 
@@ -325,7 +338,7 @@ class Units:
         """
         first, sent = self.p.consists.first, state.work.sent
         live = air._replace(live=True) if first_time else air
-        integrate.exchange(self.parts, loop, first, links, self.p.reference, live, t, own, state.estimate, state.work)
+        integrate.exchange(self.parts, loop, first, links, references, live, t, own, state.estimate, state.work)
         messages, _ = exchange.deliver(self.radio, messages, sent.copy(), own[self.p.heads, POSITION], links, number)
         fresh = ~messages.ever
         messages.heard[fresh] = sent[links.sender[fresh]]

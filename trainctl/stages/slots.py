@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trainctl.scenario.build import Prepared
-from trainctl.signals import Floats, Formed, Ints, Links, Seen
+from trainctl.scenario.model import Prepared
+from trainctl.signals import Floats, Formed, Ints, Links, References, Seen
 from trainctl.stages.record import Journal
 from trainctl.stages.traffic import Around
 from trainctl.stages.traffic import State as Traffic
@@ -23,6 +23,8 @@ class State(NamedTuple):
 class Slots:
     """Trains on one track form; who changes track leaves one formation and joins another."""
 
+    CHECKS = True  # whether a law's start condition is asked again where links changed
+
     def __init__(self, p: Prepared, journal: Journal) -> None:
         self.p, self.journal = p, journal
         self.track_of = np.array([p.line.track_ids.index(t) for t in p.line.tracks], np.int64)
@@ -30,7 +32,9 @@ class Slots:
     def initial(self) -> tuple[State, Formed]:
         """Everybody belongs to the formation of the track he starts on."""
         n, track = len(self.p.scenario.ids), self.p.start_track.copy()
-        return State(track), Formed(None, track.copy(), np.full(n, -1), np.ones(n, bool), np.zeros(n), None, (), None)
+        return State(track), Formed(
+            None, track.copy(), np.full(n, -1), np.ones(n, bool), np.zeros(n), References.one(self.p.reference, n), (), None
+        )
 
     def step(
         self, t: float, seen: Seen, own: Floats, around: Around, traffic: Traffic, s: State, formed: Formed
@@ -49,6 +53,10 @@ class Slots:
             formed = formed._replace(formation=admitted)
         order = graph.order_on_tracks(seen.position, formed.formation)
         return s, formed, own, seen, graph.links(self.p.plan, order, formed.formation)
+
+    def after(self, formed: Formed) -> Formed:
+        """A step later: the reference of all trains is that of the scenario."""
+        return formed
 
     def _admit(self, t: float, seen: Seen, own: Floats, track: Ints, moved: Ints, formed: Formed) -> Ints | None:
         """Let trains join the formation of their track; where the law needs its start condition, only once it holds.

@@ -12,7 +12,7 @@ import numpy as np
 
 from trainctl.errors import CouplingError
 from trainctl.railway.ways import ways
-from trainctl.scenario.build import Prepared
+from trainctl.scenario.model import Prepared
 from trainctl.signals import Bools, Floats, Ints, Observed, Seen
 from trainctl.sumo.baseline_files import departures, verify_signals, write_configuration, write_routes
 from trainctl.sumo.session import TOLERANCE_M, Session

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trainctl.signals import Bools, Floats, Ints, Links
+from trainctl.signals import Bools, Floats, Ints, Links, Pace, References
 
 #: Reference of one train alone, m behind which it draws near with a speed in proportion to the distance [s].
 APPROACH_S = 20.0
@@ -27,6 +27,14 @@ class Spacing(NamedTuple):
     lower: float  # m
     upper: float  # m
     weight: float
+
+
+def references(pace: Pace, t: float) -> References:
+    """References of trains that go on at constant acceleration from ``t`` [s], each of its own; copies."""
+    n = len(pace.position)
+    breaks = np.column_stack([np.full(n, t), np.full(n, np.inf)])
+    position = np.column_stack([pace.position, pace.speed, 0.5 * pace.acceleration])
+    return References(breaks, position[:, None], np.arange(n))
 
 
 def fronts(ahead: Ints) -> Ints:

@@ -1,0 +1,104 @@
+"""Whether law, plant, observer, exchange and disturbances of a scenario go together."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from trainctl.laws import unfit
+from trainctl.plants import disturbance
+from trainctl.scenario.limits import room
+from trainctl.scenario.model import Prepared
+from trainctl.topology import graph
+
+
+def can_brake(p: Prepared) -> list[str]:
+    """Whether every train can do what the supervisor relies on."""
+    rules = p.supervision
+    short = np.flatnonzero(p.sure_braking < rules.emergency_mps2 - 1e-9) if rules.mode != "off" else np.zeros(0, np.int64)
+    if not len(short):
+        return []
+    i = int(short[np.argmin(p.sure_braking[short])])
+    least, among = p.sure_braking[i], f" (and {len(short) - 1} other trains too little)" if len(short) > 1 else ""
+    return [
+        f"supervisor.emergency_mps2 = {rules.emergency_mps2:g}: train {p.scenario.ids[i]} can brake with {least:.6g} m/s2 at"
+        f" most{among}"
+    ]
+
+
+def fits(p: Prepared) -> list[str]:
+    """Law, plant and observer that do not go together, bounds no train can keep, a line that is too short."""
+    found = (
+        [] if p.law.CLOCK == "none" else unfit(p.law, p.scenario.controller.law, p.scenario.plant.kind, p.scenario.observer.kind)
+    )
+    for i, t in enumerate(p.scenario.train):
+        for key, low, high in (
+            ("speed", p.bounds.speed_lower[i], p.bounds.speed_upper[i]),
+            ("input", p.bounds.input_lower[i], p.bounds.input_upper[i]),
+        ):
+            if not low < high:
+                found.append(f"train[{t.id}]: {key} bounds {low:g} .. {high:g} are empty")
+    if p.self_driven:
+        return found + list(p.law.unfit(p.scenario))
+    found += [*_messages_fit(p), *_disturbances_fit(p)]
+    if p.sampled:
+        least, greatest = room(p.scenario.bounds_of_trains(), p.plant, p.consists)
+        for i, t in enumerate(p.scenario.train):
+            if p.bounds.input_lower[i] < least[i] - 1e-12:
+                found.append(
+                    f"train[{t.id}].input_lower_mps2 = {p.bounds.input_lower[i]:g}: its units can brake with"
+                    f" {-least[i]:.6g} m/s2 at most"
+                )
+            if p.bounds.input_upper[i] > greatest[i] + 1e-12:
+                found.append(
+                    f"train[{t.id}].input_upper_mps2 = {p.bounds.input_upper[i]:g}: its units can give"
+                    f" {greatest[i]:.6g} m/s2 at most in the speed band"
+                )
+    return found
+
+
+def _messages_fit(p: Prepared) -> list[str]:
+    """Exchange periods, loss and delay against the law's clock."""
+    run, top = p.scenario.run, p.scenario.topology
+    period = top.communication_period_s
+    if p.sampled:
+        return (
+            []
+            if period is None
+            else ["topology.communication_period_s: sampled laws exchange once per control period; leave it out"]
+        )
+    if period is None:
+        return (
+            ["topology.communication_period_s: missing; loss and delay need messages sent at instants"]
+            if top.loss + top.delay_s > 0
+            else []
+        )
+    ratio = run.step_s / period
+    if min(abs(ratio - round(ratio)), abs(1 / ratio - round(1 / ratio))) > 1e-9:
+        return [f"topology.communication_period_s = {period:g}: must divide step_s = {run.step_s:g} or be a multiple of it"]
+    h = run.step_s / run.sub_steps
+    if abs(period / h - round(period / h)) > 1e-6:
+        return [f"topology.communication_period_s = {period:g}: must be a multiple of the integrator's step {h:g} s"]
+    return []
+
+
+def _disturbances_fit(p: Prepared) -> list[str]:
+    """Disturbances this law and plant cannot take, and what is wrong in themselves, or in the plant."""
+    scenario = p.scenario
+    found = disturbance.violations(scenario.disturbance, scenario.ids, scenario.run.seed, hasattr(p.law, "worst"))
+    for k, entry in enumerate(scenario.disturbance, 1):
+        if entry.on == "measurement" and not p.sampled:
+            found.append(f"disturbance[{k}].on = measurement: needs a sampled law; a continuous one has no instants to measure at")
+    found += p.plant.violations(p.plant_params, p.first_scene, scenario.fault)
+    if p.plant.noise_hold(p.plant_params) is not None and scenario.run.seed is None:
+        found.append("run.seed: missing; the plant's noise is random")
+    return found
+
+
+def connected(p: Prepared) -> list[str]:
+    """Assumption of every law: the graph of a formation is connected. Trains alone on a track are formations of their own."""
+    links = p.first_scene.links
+    groups = graph.components(len(p.scenario.train), links.sender, links.receiver)
+    if p.plan.rule == "links" and len(groups) > 1:
+        named = " | ".join(", ".join(p.scenario.ids[i] for i in g) for g in groups)
+        return [f"topology: the graph of the [[link]] tables is not connected: {named}"]
+    return []

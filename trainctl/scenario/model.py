@@ -1,0 +1,287 @@
+"""A scenario as arrays, with the modules it names and the numbers that follow from it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sumo_net import Rails
+from trainctl import draws
+from trainctl.davis import resistance
+from trainctl.plants import disturbance
+from trainctl.railway import supervisor
+from trainctl.railway.authority import DRIVER_MARGIN_M
+from trainctl.scenario import limits, promise
+from trainctl.scenario.tables import Scenario, Traffic
+from trainctl.signals import (
+    POSITION,
+    SPEED,
+    Bounds,
+    Consists,
+    Floats,
+    Ints,
+    Links,
+    Observer,
+    Plant,
+    Reference,
+    Scene,
+    leader_at,
+    restrict,
+)  # fmt: skip
+from trainctl.topology import convoys, graph
+from trainctl.topology.exchange import Radio
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A scenario as arrays, and the modules it names. ``spec`` is the line's description, or None if it came as a net."""
+
+    scenario: Scenario
+    file: str
+    law: Any
+    params: Any
+    plant: Plant
+    plant_params: Any
+    observer: Observer
+    observer_params: Any
+    consists: Consists
+    own: Floats
+    bounds: Bounds
+    reference: Reference
+    plan: graph.Plan
+    first_links: Links
+    line: Any  # Line; None only while mistakes are still being gathered
+    spec: Any
+    net: Path | None
+    roster: Any  # Roster; None like the line
+
+    @property
+    def rails(self) -> Rails:
+        """The net as a graph, its edges numbered as those of the line."""
+        rails: Rails = self.roster.rails
+        return rails
+
+    @property
+    def placed(self) -> bool:
+        """Whether [[train]] tables place the trains: those on one track are a formation with slots. Others come and go."""
+        return self.scenario.network.sumocfg is None
+
+    @cached_property
+    def supervision(self) -> supervisor.Params:
+        """How trains are protected: as the scenario says, else only where they come and go.
+
+        Where the scenario states no emergency braking, and no greatest acceleration, they are the supervisor's usual ones, or more
+        if the bounds of the inputs allow the law more: it must not act on what the law may do. No braking is relied on that some
+        train cannot give.
+        """
+        stated = self.scenario.supervisor or supervisor.Params()
+        known: dict[str, Any] = {}
+        if "mode" not in stated.model_fields_set and not self.placed:
+            known["mode"] = "on"
+        if "greatest_mps2" not in stated.model_fields_set:
+            pulls = self.bounds.input_upper
+            known["greatest_mps2"] = float(max([stated.greatest_mps2, *pulls[np.isfinite(pulls)]]))
+        if "emergency_mps2" not in stated.model_fields_set:
+            v = self.fastest
+            brakes = resistance(v, self.consists.train_davis()) - self.bounds.input_lower
+            wanted = math.ceil(1000.0 * max([stated.emergency_mps2, *brakes[np.isfinite(brakes)]])) / 1000.0
+            known["emergency_mps2"] = min(wanted, float(np.floor(1000.0 * self.sure_braking.min())) / 1000.0)
+            known["service_mps2"] = min(stated.service_mps2, known["emergency_mps2"])
+        return stated.model_copy(update=known)
+
+    @property
+    def fastest(self) -> Floats:
+        """Speed up to which every train is looked at [m/s], shape (n,)."""
+        upper = self.bounds.speed_upper
+        found: Floats = np.where(np.isfinite(upper), upper, max(self.leader(0.0)[1], 1.0))
+        return found
+
+    @cached_property
+    def sure_braking(self) -> Floats:
+        """Deceleration every train can give on the level at any speed it may have [m/s2], shape (n,); infinite for free points."""
+        given = self.plant.sure_braking(self.plant_params, self.consists, promise.top_speed(self))
+        return np.minimum(given, -self.clamps.input_lower)
+
+    @cached_property
+    def clamps(self) -> Bounds:
+        """Where the plant itself clamps every train, infinite where it does not.
+
+        It does where [plant] says so, and for a law whose model clamps: then at the train's bounds, the tightest of what is said.
+        """
+        everywhere = getattr(self.law, "CLAMPED", False)
+        return limits.clamps(everywhere, self.plant, self.plant_params, self.bounds)
+
+    @cached_property
+    def assumed(self) -> supervisor.Assumed:
+        """What the supervisor relies on of every train."""
+        return promise.assume(self)
+
+    @property
+    def heads(self) -> Ints:
+        """Rows of the head units in per-unit arrays, shape (n,)."""
+        return self.consists.first[:-1]
+
+    @property
+    def sampled(self) -> bool:
+        """Whether the law is evaluated once per control period."""
+        return bool(self.law.CLOCK == "sampled")
+
+    @property
+    def self_driven(self) -> bool:
+        """Whether the simulator drives the trains by itself: no law of ours, and no plant."""
+        return bool(self.law.CLOCK == "none")
+
+    @property
+    def has_units(self) -> bool:
+        """Whether every unit of a train moves by itself."""
+        return bool(self.plant.UNITS) and not self.self_driven
+
+    @property
+    def theta(self) -> float:
+        """Lead of the plant: x(k+1) = x + ((1 - theta) v(k) + theta v(k+1)) T_c under a held acceleration."""
+        return self.plant.lead(self.scenario.run.held_steps)
+
+    @property
+    def step_theta(self) -> float:
+        """Lead of the plant over one step of the simulator, as the supervisor counts it."""
+        return self.plant.lead(1)
+
+    @cached_property
+    def driving(self) -> Traffic:
+        """How trains that come and go are driven."""
+        return self.scenario.traffic or Traffic()
+
+    @cached_property
+    def driver_rules(self) -> supervisor.Params:
+        """By what a driver judges: he brakes as planned and keeps farther away, so that the supervisor has nothing to do."""
+        rules = self.supervision
+        rate = min(self.driving.deceleration_mps2, rules.emergency_mps2)
+        return rules.model_copy(update={
+            "mode": "on", "emergency_mps2": rate, "service_mps2": rate, "greatest_mps2": self.driving.acceleration_mps2,
+            "margin_m": rules.margin_m + DRIVER_MARGIN_M, "emergency_distance_m": 0.0,
+        })  # fmt: skip
+
+    @cached_property
+    def relied_on_by_driver(self) -> supervisor.Assumed:
+        """What a driver relies on of every train."""
+        return promise.planned(self.assumed, self.driver_rules.emergency_mps2)
+
+    @property
+    def driven(self) -> bool:
+        """Whether a driver drives who is in no formation; else the law leads every train, or SUMO does."""
+        return not (self.placed or self.self_driven)
+
+    @property
+    def looks_ahead(self) -> bool:
+        """Whether anybody asks what is ahead of a train: its driver, or the supervisor."""
+        return self.driven or self.supervision.mode != "off"
+
+    @cached_property
+    def net_slope(self) -> Floats:
+        """Slope of every edge, rise / run, (E,); 0 on a line, whose gradient is known by the kilometrage."""
+        return np.zeros_like(self.rails.slope) if self.placed else self.rails.slope
+
+    @property
+    def radio(self) -> Radio:
+        """How messages travel."""
+        run, top = self.scenario.run, self.scenario.topology
+        period = top.communication_period_s or run.control_period_s or run.step_s
+        names = np.array([draws.word(name) for name in self.scenario.ids], np.int64)
+        return Radio(top.loss, round(top.delay_s / period), top.range_m or np.inf, run.seed or 0, names)
+
+    @property
+    def spacing(self) -> convoys.Spacing:
+        """What every link of a convoy has."""
+        top = self.scenario.topology
+        return convoys.Spacing(
+            float(top.spacing_m or 0.0), -np.inf if top.lower_m is None else top.lower_m,
+            np.inf if top.upper_m is None else top.upper_m, top.weight,
+        )  # fmt: skip
+
+    @cached_property
+    def cruise(self) -> Floats:
+        """Speed every driver would like to keep [m/s], shape (n,)."""
+        found: Floats = np.minimum(float(self.scenario.reference.speed_mps or 0.0), self.roster.top_speed)
+        return found
+
+    @cached_property
+    def band(self) -> tuple[float, float]:
+        """Least and greatest speed of a convoy's reference that the law takes [m/s]; infinite where there are no convoys."""
+        return speed_band(self) if not self.placed and self.roster.cooperates.sum() > 1 else (-math.inf, math.inf)
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the sampled law keeps a state of its own from one control instant to the next."""
+        return self.sampled and hasattr(self.law, "initial")
+
+    @cached_property
+    def start_track(self) -> Ints:
+        """Track of every train at the start, as index into ``line.track_ids``."""
+        return np.array([self.line.track_ids.index(t.track) for t in self.scenario.train], np.int64)
+
+    def scene(self, own: Floats, links: Links, time: float) -> Scene:
+        """What the law needs to check itself and to prepare its constants."""
+        run = self.scenario.run
+        return Scene(
+            trains=self.scenario.ids, consists=self.consists, own=own, links=links, bounds=self.bounds, reference=self.reference,
+            time=time, step=run.step_s, control_period=run.control_period_s or run.step_s, lead=self.theta,
+            sub_step=run.step_s / run.sub_steps if self.plant.UNITS else run.step_s,
+        )  # fmt: skip
+
+    @cached_property
+    def first_scene(self) -> Scene:
+        """The scene at time 0."""
+        return self.scene(self.own, self.first_links, 0.0)
+
+    @property
+    def worst(self) -> disturbance.Worst | None:
+        """The law's own worst disturbance of a pair of trains, if it knows one."""
+        function = getattr(self.law, "worst", None)
+        return None if function is None else partial(function, self.params, self.first_scene)
+
+    def leader(self, t: float) -> Floats:
+        """Position, speed, acceleration and jerk of the reference at ``t``, shape (4,)."""
+        out = np.empty(4)
+        leader_at(self.reference, t, t, out)
+        return out
+
+
+#: How exactly the band is found [m/s].
+BAND_MPS = 0.05
+
+
+def speed_band(p: Prepared) -> tuple[float, float]:
+    """Least and greatest speed of a reference with which the law takes one train of each kind as a formation [m/s]."""
+    spacing = p.spacing
+    cruise = float(p.scenario.reference.speed_mps or 0.0)
+    kinds = np.unique([t.type for t in p.scenario.train], return_index=True)[1]
+    others = np.setdiff1d(np.arange(len(p.scenario.train)), kinds)
+    members = np.sort(np.concatenate([kinds, others[: max(2 - len(kinds), 0)]]))
+    ahead: Ints = np.full(len(p.scenario.train), -1)
+    ahead[members[1:]] = members[:-1]
+    order = convoys.front_to_rear(ahead)
+    slot = convoys.slots(ahead, order, spacing.desired, np.zeros(len(ahead)))
+    links = convoys.links(ahead, order, slot, spacing)
+    units, own = np.diff(p.consists.first), p.own.copy()
+    own[:, POSITION] += np.repeat(slot - own[p.heads, POSITION], units)
+
+    def takes(v: float) -> bool:
+        own[:, SPEED] = v
+        scene = p.scene(own, links, 0.0)._replace(reference=Reference(np.array([0.0, np.inf]), np.array([[0.0, v, 0.0]])))
+        return not p.law.violations(p.params, restrict(scene, members))
+
+    def end(good: float, bad: float) -> float:
+        if takes(bad):
+            return bad
+        while abs(good - bad) > BAND_MPS:
+            middle = 0.5 * (good + bad)
+            good, bad = (middle, bad) if takes(middle) else (good, middle)
+        return good
+
+    top = cruise + (p.driving).catch_up_mps
+    return end(cruise, 0.0), end(cruise, top)
