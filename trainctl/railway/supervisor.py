@@ -119,6 +119,7 @@ class Assumed(NamedTuple):
     surge: Floats  # m/s, >= 0: its speed may rise by this where the slope changes and its actuators follow late
     uncertainty: Floats  # m, >= 0, of its measured position
     blur: float  # m/s, of every measured speed
+    within: bool = False  # trains may stop within a step and stand for the rest of it, not at its end only
 
 
 class Targets(NamedTuple):
@@ -286,7 +287,10 @@ def _braking(params: Params, relied: Assumed, speed: Floats, now: Floats, target
         margin = margin + relied.uncertainty[i] + np.where(j >= 0, relied.uncertainty[j], 0.0)
     room = np.minimum(targets.room, _FAR) - np.where(stop, 0.0, margin)
     follows = a_train & targets.moving & (params.curve == "relative")
-    away = stopping_distance(np.maximum(targets.speed - relied.blur, 0.0), relied.hardest[j], step, theta)
+    slowest = np.maximum(targets.speed - relied.blur, 0.0)
+    away = stopping_distance(slowest, relied.hardest[j], step, theta)
+    if relied.within:
+        away = np.minimum(away, 0.5 * slowest**2 / relied.hardest[j])
     to_stop = np.where(follows, room + away, room)
     if (meets := opposing & targets.moving).any():
         comes = stopping_distance(targets.speed + np.where(j >= 0, more[j], 0.0), relied.braking[j], step, theta)
