@@ -25,6 +25,8 @@ from trainctl.world import World
 
 #: Slower than this is a stand [m/s].
 STANDS = 1e-9
+#: An observer whose estimates pass this has diverged, though the train it watches may still be where it should.
+ASTRAY = 1e30
 
 
 class State(NamedTuple):
@@ -236,5 +238,9 @@ class Loop(Steps):
             wrong = np.flatnonzero(~(finite & np.isfinite(motion.displacement)))
             names = ", ".join(self.p.scenario.ids[i] for i in wrong)
             raise LawError(f"the state of train {names} is no longer finite after {t:g} s: the law or the step diverged")
+        astray = np.flatnonzero(~(np.abs(moved.state.estimate) < ASTRAY).all(axis=1))
+        if len(astray):
+            names = ", ".join(dict.fromkeys(self.p.scenario.ids[i] for i in np.searchsorted(self.p.heads, astray, "right") - 1))
+            raise LawError(f"the estimates of train {names} passed {ASTRAY:g} after {t:g} s: its observer diverged")
         for i in np.flatnonzero(motion.clipped).tolist():
             self.journal.event(t, "limit", train=self.p.scenario.ids[i], what="backwards", note="held at standstill")

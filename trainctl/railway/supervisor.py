@@ -32,11 +32,13 @@ no margin touched: before a fixed point ``d >= D(v)``, behind a moving train ``d
    is taken at ``v + drift`` with the sure braking, D of the train ahead with the hardest, and ``scatter`` is taken off the
    greatest acceleration. A train that brakes more weakly than the one ahead comes nearest at the end or now (while the closing
    speed is positive it grows), so 2. holds with ``braking <= hardest``.
-4. An actuator of lag r follows what is ordered late: ``a' = (u - a) / r``. Under full braking the speed ``v + r (a + braking)``
-   falls just as that of a train without lag, and is never below v, so it takes the place of v before points; before speed limits
-   ``v + r max(a, 0)`` does, the speed reached once no more is ordered. Where the slope changes by ds the force follows late too,
-   which gives the speed ``r g ds``; over a whole route that is at most ``surge``. Couplers that swing may speed up the head by
-   ``swing``, what their energy and that of the units against each other can give it.
+4. An actuator of lag r follows what is ordered late: ``a' = (u - a) / r``. Under full braking the speed ``v + r (a + braking +
+   scatter)`` falls just as that of a train without lag, and is never below v, so it takes the place of v before points; before
+   speed limits ``v + r max(a + scatter, 0)`` does, the speed reached once no more is ordered. The a of an actuator leaves out
+   what acts beside it, up to ``scatter``; and v still rises while the one is negative and their sum is not. Where the slope
+   changes by ds the force follows late too, which gives the speed ``r g ds``; over a whole route that is at most ``surge``.
+   Couplers that swing may speed up the head by ``swing``, what their energy and that of the units against each other can give
+   it.
 
 Holding the speed v behind a train of the same speed therefore needs v T beyond the margin: the train ahead may begin to brake
 now, its follower learns of it one step later.
@@ -279,7 +281,7 @@ class _Braking(NamedTuple):
 def _braking(params: Params, relied: Assumed, speed: Floats, now: Floats, targets: Targets, step: float, theta: float) -> _Braking:
     i, j = targets.train, targets.other
     a_train, opposing, stop = targets.kind == TRAIN, targets.kind == OPPOSING, targets.kind == STOP
-    more = relied.drift + relied.surge + relied.lag * np.maximum(now + relied.braking, 0.0)
+    more = relied.drift + relied.surge + relied.lag * np.maximum(now + relied.braking + relied.scatter, 0.0)
     v, b = speed[i] + np.where(stop, relied.drift[i], more[i]), relied.braking[i]  # the room to a stop counts the lag already
     own = stopping_distance(v, b, step, theta)
     margin: Floats | float = params.margin_m
@@ -334,7 +336,7 @@ def _before_limits(
     params: Params, relied: Assumed, speed: Floats, now: Floats, swing: Floats | float, limits: Limits, step: float, theta: float
 ) -> Floats:
     """Greatest acceleration each limit leaves its train [m/s2], shape (k,)."""
-    settled = speed + swing + (relied.lag * np.maximum(now, 0.0) if relied.lag.any() else 0.0)
+    settled = speed + swing + (relied.lag * np.maximum(now + relied.scatter, 0.0) if relied.lag.any() else 0.0)
     train = limits.train
     v, top = settled[train], settled[train] + (params.greatest_mps2 + relied.scatter[train]) * step
     rate = np.full(len(v), np.inf)
