@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 from xml.parsers import expat
@@ -12,6 +13,17 @@ from sumo_net.spec import LineError
 
 #: Vehicle classes that make an edge a railway.
 RAIL = frozenset(("rail", "rail_electric", "rail_fast", "rail_urban", "tram", "subway", "cable_car"))
+
+
+def for_trains(lane: Mapping[str, str], anybody: bool = False) -> bool:
+    """Whether a lane is for trains: it allows a rail class by name, or where ``anybody`` counts does not keep them out."""
+    if not RAIL.isdisjoint(lane.get("allow", "").split()):
+        return True
+    return anybody and lane.get("allow", "all") == "all" and not _keeps_out(lane.get("disallow", "").split())
+
+
+def _keeps_out(disallowed: list[str]) -> bool:
+    return "all" in disallowed or set(disallowed) >= RAIL
 
 
 class NetEdge(NamedTuple):
@@ -36,6 +48,7 @@ class NetFile(NamedTuple):
     connections: list[dict[str, str]]
     junctions: list[NetJunction]
     version: str  # of the format; "" if it says none
+    others: list[str]  # tags of all other elements
 
 
 def content(path: Path) -> bytes:
@@ -72,7 +85,7 @@ def read_net(path: Path) -> NetFile:
     LineError
         If there is no such file, it cannot be read, or it is not a net.
     """
-    net = NetFile([], [], [], "")
+    net = NetFile([], [], [], "", [])
     inside: NetEdge | NetJunction | None = None
     depth = 0
 
@@ -87,6 +100,8 @@ def read_net(path: Path) -> NetFile:
                 net.edges.append(inside := NetEdge(attributes, [], {}))
             elif tag == "junction":
                 net.junctions.append(inside := NetJunction(attributes, []))
+            else:
+                net.others.append(tag)
         elif depth == 3 and inside is not None:
             if tag == "lane" and isinstance(inside, NetEdge):
                 inside.lanes.append(attributes)

@@ -8,7 +8,7 @@ position grows along every way like the distance run.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from heapq import heappop, heappush
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from sumo_net.layout import Floats
 from sumo_net.line import Ints, Line, line_of
-from sumo_net.netfile import RAIL, NetEdge, NetFile, NetJunction, read_net
+from sumo_net.netfile import NetEdge, NetFile, NetJunction, for_trains, read_net
 from sumo_net.spec import TRACK_SPACING_M, LineError
 
 Bools = NDArray[np.bool_]
@@ -47,7 +47,7 @@ class Rails:
     reversal: frozenset[tuple[int, int]]  # pairs of after from an edge to its twin: there a train changes its direction
 
     @classmethod
-    def read(cls, path: str | Path) -> Rails:
+    def read(cls, path: str | Path, over: Collection[str] = ()) -> Rails:
         """The rail net in a net file.
 
         Parameters
@@ -56,12 +56,15 @@ class Rails:
             A SUMO net file. Of its edges those are taken that are made for trains: with a rail class among the vehicles that
             are allowed. In a net that ``sumo_net`` built, order and kilometrage are those of ``Line.read``.
 
+        over : collection of str
+            Edges that trains run over; they are taken too if they let everybody on.
+
         Raises
         ------
         LineError
             If there is no such file, it is not a net, it has no rail edges, or it says no length or speed of one.
         """
-        return _rails(read_net(Path(path)), str(path))
+        return _rails(read_net(Path(path)), str(path), frozenset(over))
 
     @classmethod
     def of(cls, line: Line) -> Rails:
@@ -221,10 +224,6 @@ class _Link(NamedTuple):
     lanes: tuple[str, ...]
 
 
-def _for_trains(lane: dict[str, str]) -> bool:
-    return not RAIL.isdisjoint(lane.get("allow", "").split())
-
-
 def _links(connections: list[dict[str, str]], lanes: dict[str, str], inside: dict[str, str], bidi: dict[str, str]) -> list[_Link]:
     """The connections between lanes over others inside junctions (id: edge) that trains can take, one for each pair of edges.
 
@@ -306,16 +305,17 @@ def _measure(lane: dict[str, str]) -> tuple[float, float, Floats]:
     return length, speed, _shape(lane)
 
 
-def _rails(net: NetFile, file: str) -> Rails:
+def _rails(net: NetFile, file: str, over: frozenset[str]) -> Rails:
     by_id = {e.attributes.get("id", ""): e for e in net.edges}
-    lane_of = {name: lane for name, e in by_id.items() if (lane := next(filter(_for_trains, e.lanes), None)) is not None}
+    # What lies inside a junction is only taken between edges for trains.
+    anybody = {name for name, e in by_id.items() if name in over or (over and e.attributes.get("function") == "internal")}
+    open_lanes = {name: [lane for lane in e.lanes if for_trains(lane, name in anybody)] for name, e in by_id.items()}
+    lane_of = {name: found[0] for name, found in open_lanes.items() if found}
     normal = [name for name in lane_of if by_id[name].attributes.get("function", "normal") == "normal"]
     if not normal:
         raise LineError([f"{file}: has no rail edges: none of its lanes allows a rail class by name"])
     within = [name for name in lane_of if by_id[name].attributes.get("function") == "internal"]
-    lanes, inside = (
-        {lane.get("id", ""): name for name in part for lane in by_id[name].lanes if _for_trains(lane)} for part in (normal, within)
-    )
+    lanes, inside = ({lane.get("id", ""): name for name in part for lane in open_lanes[name]} for part in (normal, within))
     bidi = _directions(net)
     links = _links(net.connections, lanes, inside, bidi)
     uses = Counter(edge for link in links for edge in {inside[lane] for lane in link.lanes})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sumo_net.line import rail_edges
-from sumo_net.netfile import RAIL, read_net
+from sumo_net.netfile import for_trains, read_net
 from sumo_net.spec import LineError
 
 
@@ -22,8 +23,8 @@ class Piece(NamedTuple):
     points: NDArray[np.float64]  # (P, 2) m
 
 
-def shapes(net: Path) -> list[Piece]:
-    """The rail edges of a net in its own coordinates, in the order of the file.
+def shapes(net: Path, over: Collection[str] = ()) -> list[Piece]:
+    """The rail edges of a net in its own coordinates, in the order of the file; those of ``over`` also if they let everybody on.
 
     Raises
     ------
@@ -32,10 +33,10 @@ def shapes(net: Path) -> list[Piece]:
     """
     found = []
     for edge in read_net(net).edges:
-        lane = next((lane for lane in edge.lanes if not RAIL.isdisjoint(lane.get("allow", "").split())), None)
+        name = edge.attributes.get("id", "")
+        lane = next((lane for lane in edge.lanes if for_trains(lane, name in over)), None)
         if lane is None:
             continue
-        name = edge.attributes.get("id", "")
         try:
             points = np.array([[float(v) for v in point.split(",")[:2]] for point in lane["shape"].split()])
             found.append(Piece(name, edge.attributes.get("function") == "internal", float(lane["speed"]), points.reshape(-1, 2)))

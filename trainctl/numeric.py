@@ -16,6 +16,15 @@ def lay_out(line: Line, start: Start) -> Ways:
     return ways([[line.index[e] for e in route] for route in start.routes], line.start_m, line.length_m)
 
 
+#: A train whose front is this close to the end of its way has left the net when a step ends (SUMO's POSITION_EPS).
+LEAVES_M = 0.1
+
+
+def way_lengths(ways: Ways, line: Line, arrival: Floats) -> Floats:
+    """Where every train leaves, from the beginning of the last edge of its way (n,) [m]."""
+    return np.minimum(arrival, line.length_m[ways.edge[ways.first[1:] - 1]])
+
+
 class Numeric:
     """The line without a simulator: trains follow their ways by addition, and leave at the end."""
 
@@ -28,6 +37,7 @@ class Numeric:
         self.row = self.ways.first[:-1].copy()
         self.lane_position = start.lane_position.copy()
         self.present = start.present.copy()
+        self.arrival = np.full(len(self.row), np.inf) if start.arrival is None else start.arrival
         self.coming: list[int] = []
 
     def measure(self) -> Seen:
@@ -50,7 +60,7 @@ class Numeric:
         """Nobody looks."""
 
     def move(self, displacement: Floats, step: float) -> None:
-        """Move every train; as in SUMO a train on the very end of an edge is still on it."""
+        """Move every train; as in SUMO one on the very end of an edge is still on it, and one near the end of its way is gone."""
         self.lane_position += np.where(self.present, displacement, 0.0)
         edge, length = self.ways.edge, self.line.length_m
         for i in np.flatnonzero(self.lane_position > length[edge[self.row]]).tolist():
@@ -58,7 +68,8 @@ class Numeric:
             while self.lane_position[i] > length[edge[self.row[i]]] and self.row[i] < last:
                 self.lane_position[i] -= length[edge[self.row[i]]]
                 self.row[i] += 1
-            self.present[i] = self.lane_position[i] <= length[edge[self.row[i]]]
+        ends = way_lengths(self.ways, self.line, self.arrival) - LEAVES_M
+        self.present &= (self.row < self.ways.first[1:] - 1) | (self.lane_position <= ends)
         self.present[self.coming] = True
         self.coming.clear()
 

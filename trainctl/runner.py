@@ -222,6 +222,8 @@ def _driven(
     try:
         with _stops() as stop:
             journal = Journal(partial, p, saved.values["recorder"] if saved else None)
+            for note in p.roster.notes if saved is None else ():
+                journal.event(0.0, "not_followed", what=note)
             if p.self_driven:
                 world = open_self_driven(p, partial)
                 simulation = Watched(p, world, journal)

@@ -425,6 +425,7 @@ class Start(NamedTuple):
     routes: Sequence[tuple[str, ...]]  # edge ids from the edge a train starts on, internal ones included
     present: Bools  # (n,) the others come later
     vclass: Sequence[str]  # SUMO's class of vehicle
+    arrival: Floats | None = None  # (n,) m, from the beginning of the last edge, where a train leaves; None, inf: at its end
 
 
 class Seen(NamedTuple):

@@ -56,7 +56,7 @@ CASES = {
         [(CONFIGURATION, "", "<net/>")], ["merging.sumocfg: not a SUMO configuration: it begins with <net>, not <sumoConfiguration>"],
     ),
     "configuration without routes": (
-        [(CONFIGURATION, '<route-files value="merging.rou.xml"/>', "")], ["merging.sumocfg: no route-files"],
+        [(CONFIGURATION, '<route-files value="merging.rou.xml"/>', "")], ["merging.sumocfg: no route-files, nor additional-files with trains in them"],
     ),
     "routes are neither": ([(ROUTES, "", "<net/>")], ["merging.sumocfg: no trains: no vehicle, trip or flow has a vType of a rail class"]),
     "trains of its own": (
@@ -135,7 +135,7 @@ def test_a_run_that_broke_off_is_not_shown_but_begun_again(typed, tmp_path, monk
         raise SimulatorError("pulled the plug")
 
     with monkeypatch.context() as patch:
-        patch.setattr("trainctl.world.Numeric.move", broken)
+        patch.setattr("trainctl.numeric.Numeric.move", broken)
         code, _ = typed("run", "mistaken.toml", "--backend", "numeric", "--set", "run.duration_s=16", "--out", "r")
     assert code == 3
     assert typed("replay", "r.partial", "--gui-program", "sumo")[0] == 2

@@ -29,6 +29,7 @@ endPos="-100"/><busStop id="east" lane="cd_0" startPos="10" endPos="900.5"/></ad
 CUSTOM = """<vType id="t" vClass="rail" length="100" speedFactor="0.9" sigma="0" maxSpeed="60" carFollowModel="Rail" trainType="custom"
 maxPower="2350" maxTraction="150" resCoef_quadratic="0.01" resCoef_linear="0.02" resCoef_constant="1.67" mass="90000" massFactor="1.08"
 decel="0.8"><param key="who" value="me"/></vType>"""
+V = '<vehicle id="v" type="t" depart="0"'
 ROUTE = '<route id="main" edges="ab bc cd"/>'
 SUMOCFG = """<configuration><input><net-file value="n.net.xml"/><route-files value="{routes}"/><additional-files value="{more}"/></input>
 <time><begin value="{begin}"/>{end}<step-length value="0.5"/></time></configuration>"""
@@ -236,17 +237,45 @@ def test_what_is_not_followed_is_told(files: Files) -> None:
         "1 definitions of persons left out",
         "1 definitions of containers left out",
         "2 vehicles, trips and flows left out: not rail",
-        "1 rerouters not followed",
         'departPos="random": the train begins with its rear at the beginning of the edge, as with "base"',
-        'departSpeed="avg": as fast as allowed',
-        "1 trains, trips and flows with an arrivalSpeed: it is not followed",
-        "1 trains, trips and flows with a speedFactor of their own: that of the vType holds",
-        "triggered of stops is not followed",
         "vType loose: speedFactor = normc(0.8,0.1,0.2,1): its mean 0.8 for every train",
+        "option step-length = 0.5: not followed: the step is run.step_s of the scenario",
+        "1 x <vehicle arrivalSpeed>: not followed: trains leave as fast as they come",
+        "1 x <vehicle speedFactor>: not followed: that of the vType holds",
+        "1 x <stop triggered>: not followed: nobody boards; a train stands as long as duration and until say",
+        "1 x <rerouter>: not followed: trains keep their routes",
     )
 
 
-V = '<vehicle id="v" type="t" depart="0"'
+def test_what_nobody_thought_of_is_named(files: Files) -> None:
+    files.write(
+        f'{V} route="main" flavour="sweet" color="red"><stop lane="bc_0" endPos="60" duration="3" mood="good"/><mystery/></vehicle>'
+        '<riddle id="r"/><riddle id="s"/>'
+    )
+    said = files.sumocfg.read_text().replace(
+        "<time>", '<strange value="7"/><fcd-output value="f.xml"/><verbose value="true"/><time>'
+    )
+    files.sumocfg.write_text(said)
+    net = files.folder / "n.net.xml"
+    net.write_text(net.read_text().replace('<edge id="ab"', '<edge id="ab" colour="blue"').replace("</net>", "<oddity/></net>"))
+    notes = read_traffic(files.sumocfg, files.folder / "work").notes
+    unknown = "not followed: it is not known here"
+    assert [n for n in notes if "not known" in n] == [
+        f"option strange = 7: {unknown}",
+        f"1 x <vehicle flavour>, 1 x <stop mood>, 1 x <mystery>: {unknown}",
+        f"2 x <riddle>: {unknown}",
+        f"net: 1 x <edge colour>: {unknown}",
+        f"net: 1 x <oddity>: {unknown}",
+    ]
+    assert not [n for n in notes if "fcd" in n or "verbose" in n or "color" in n]
+
+
+@pytest.mark.parametrize("key", ["split", "join", "jump"])
+def test_what_cannot_be_followed_is_refused_with_the_reason(files: Files, key: str) -> None:
+    (told,) = files.mistakes(f'{V} route="main"><stop lane="bc_0" endPos="60" duration="3" {key}="w"/></vehicle>')
+    assert told.startswith(f"{files.sumocfg}: 1 x <stop {key}>: ")
+
+
 MISTAKES = {
     f'{V}><route edges="ab cd"/></vehicle>': ["train v: its route is not connected: no way from edge ab to edge cd"],
     '<flow id="u" type="t" begin="0" period="10" from="bc" to="ab"/>': ["flow u: no way from edge bc to edge ab"],
@@ -340,7 +369,10 @@ def test_files_that_are_not_what_they_should_be(files: Files) -> None:
     assert told('<configuration><net-file value="other.net.xml"/><route-files value="list.xml"/></configuration>') == [
         "F/other.net.xml: not a SUMO net: its root element is <nodes>, not <net>"
     ]
-    assert told("<configuration/>") == ["F/run.sumocfg: no net-file", "F/run.sumocfg: no route-files"]
+    assert told("<configuration/>") == [
+        "F/run.sumocfg: no net-file",
+        "F/run.sumocfg: no route-files, nor additional-files with trains in them",
+    ]
     assert told(f'<configuration>{net}<route-files value="a.xml,b.xml"/><end value="soon"/></configuration>') == [
         "F/run.sumocfg: F/a.xml: no such file",
         "F/run.sumocfg: F/b.xml: no such file",

@@ -45,7 +45,7 @@ def on_the_map(drawn: Drawn, times: Floats) -> dict[str, Any] | None:
     if not nets or not log.is_file():
         return None
     try:
-        pieces = shapes(nets[0])
+        pieces = shapes(nets[0], set(drawn.run.trains.edge.astype(str)))
         seen = pd.DataFrame(pq.read_table(log, columns=list(COLUMNS)).to_pandas()).rename(columns=COLUMNS)
     except LineError as error:
         raise InputError(error.mistakes) from None

@@ -88,7 +88,7 @@ def page(run: Run) -> str:
         "script": _template("report.js"),
         "data": _inline(data),
         "about": _about(drawn),
-        "verdict": _outcome(drawn.run) + _verdict(values, drawn.run),
+        "verdict": _outcome(drawn.run) + _verdict(values, drawn.run) + _not_followed(drawn.run),
         "bounds": _bounds(values),
         "figures": _figures(values),
         "events": _events(film),
@@ -157,6 +157,14 @@ def _outcome(run: Run) -> str:
         f" {escape(line.text)}</p>"
         for line in lines
     )
+
+
+def _not_followed(run: Run) -> str:
+    """What the files of a SUMO configuration say and the run did not do, one line each."""
+    lines = [str(e["what"]) for e in run.events if e["kind"] == "not_followed"]
+    rows = "".join(f"<li>{escape(line)}</li>" for line in lines)
+    summary_line = f"<summary>{len(lines)} things in SUMO's files that are not followed as they stand</summary>"
+    return f"<details class=left>{summary_line}<ul>{rows}</ul></details>" if lines else ""
 
 
 def _verdict(values: Mapping[str, Any], run: Run) -> str:

@@ -20,6 +20,9 @@ from trainctl.scenario.train_types import train_type
 from trainctl.signals import Bools, Floats, Ints
 from trainctl.traffic.read import Departure, Traffic, read_traffic
 
+#: A train that stops at the end of its way stands this far before it [m]; nearer than 0.1 m it would have left.
+STANDS_SHORT_M = 0.2
+
 
 class Stop(NamedTuple):
     """A place on a train's way where it stands."""
@@ -28,6 +31,7 @@ class Stop(NamedTuple):
     duration: float  # s
     until: float  # s, it does not leave before; -inf if it may
     name: str
+    passing: float = 0.0  # m/s, it does not stand but passes with at most this speed; 0: it stands
 
 
 class Roster(NamedTuple):
@@ -36,13 +40,16 @@ class Roster(NamedTuple):
     depart: Floats  # (n,) s
     edge: Ints  # (n,) first edge of the way
     lane_position: Floats  # (n,) m, front, at departure
+    arrival: Floats  # (n,) m, front on the last edge of the way, where it leaves; inf: at its end
     speed: Floats  # (n,) m/s at departure, NaN: as fast as is safe
+    like: tuple[str, ...]  # who enters as fast as is safe, but no faster than those on its edge: their "avg", the "last"; else ""
     top_speed: Floats  # (n,) m/s
     speed_factor: Floats  # (n,) share of a speed limit that a train keeps to, at most 1: nobody is driven above a limit
     routes: tuple[tuple[str, ...], ...]  # edge ids, internal ones included
     stops: tuple[tuple[Stop, ...], ...]
     cooperates: Bools  # (n,)
     vclass: tuple[str, ...]
+    patience: float  # s, who cannot enter for longer does not come; inf: all come
     notes: tuple[str, ...]  # what of the configuration is not followed
     rails: Rails
     placed: bool  # by [[train]] tables, all there from the start; else they come and go
@@ -54,9 +61,10 @@ def placed(scenario: Scenario, line: Line) -> Roster:
     places = [line.locate(t.track, t.position_m) for t in scenario.train]
     return Roster(
         depart=np.zeros(n), edge=np.array([e for e, _ in places], np.int64), lane_position=np.array([x for _, x in places]),
-        speed=np.array([t.speed_mps for t in scenario.train], float), top_speed=np.full(n, np.inf), speed_factor=np.ones(n),
+        arrival=np.full(n, np.inf), speed=np.array([t.speed_mps for t in scenario.train], float), like=("",) * n,
+        top_speed=np.full(n, np.inf), speed_factor=np.ones(n),
         routes=tuple(line.route(t.track, t.position_m) for t in scenario.train), stops=((),) * n, cooperates=np.ones(n, bool),
-        vclass=("rail",) * n, notes=(), rails=Rails.of(line), placed=True,
+        vclass=("rail",) * n, patience=np.inf, notes=(), rails=Rails.of(line), placed=True,
     )  # fmt: skip
 
 
@@ -69,16 +77,20 @@ def tables(roster: Roster) -> dict[str, Any]:
 
 def from_tables(data: Mapping[str, Any], net: Path) -> Roster:
     """Read a roster back from its ``tables`` and its net."""
-    numbers = {name: np.array(data[name], float) for name in ("depart", "lane_position", "speed", "top_speed", "speed_factor")}
+    numbers = {
+        name: np.array(data[name], float) for name in ("depart", "lane_position", "arrival", "speed", "top_speed", "speed_factor")
+    }
     return Roster(
         **numbers,
         edge=np.array(data["edge"], np.int64),
         routes=tuple(tuple(route) for route in data["routes"]),
         stops=tuple(tuple(Stop(*stop) for stop in stops) for stops in data["stops"]),
         cooperates=np.array(data["cooperates"], bool),
+        like=tuple(data["like"]),
         vclass=tuple(data["vclass"]),
+        patience=float(data["patience"]),
         notes=tuple(data["notes"]),
-        rails=Rails.read(net),
+        rails=Rails.read(net, {e for route in data["routes"] for e in route}),
         placed=False,
     )
 
@@ -116,7 +128,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
     with tempfile.TemporaryDirectory(prefix="traffic.") as work:
         traffic = read_traffic(folder / str(scenario.network.sumocfg), Path(work), scenario.run.duration_s)
     try:
-        rails = Rails.read(traffic.net)
+        rails = Rails.read(traffic.net, {e for d in traffic.departures for e in d.edges})
     except LineError as error:
         raise InputError([f"network.sumocfg: {m}" for m in error.mistakes]) from None
     types, found = _types(scenario, traffic)
@@ -129,13 +141,18 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         if not any(fnmatch.fnmatchcase(i, p) for i in ids)
     ]
     found += _events(scenario, ids, rails)
-    trains, routes, stops = [], [], []
+    trains, routes, stops, arrival = [], [], [], []
     factor = np.array([min(traffic.kinds[d.kind].speed_factor, 1.0) for d in traffic.departures])
     for d, share in zip(traffic.departures, factor.tolist(), strict=True):
         try:
             way = rails.way(d.edges)
             begin = rails.start_m[way[0]] + np.concatenate([[0.0], np.cumsum(rails.length_m[way[:-1]])])
+            there = float(rails.length_m[way[-1]]) if d.arrival_m is None else d.arrival_m
+            # As in SUMO a train that stops beyond the place where it is to leave leaves there.
             stops.append(_stops(d, rails, way, begin, traffic.begin_s))
+            end = max((s.place - float(begin[-1]) for s in stops[-1] if not s.passing), default=0.0)
+            arrival.append(np.inf if max(there, end) >= float(rails.length_m[way[-1]]) else max(there, end))
+            stops[-1] = _before_the_end(stops[-1], float(begin[-1]) + min(arrival[-1], float(rails.length_m[way[-1]])))
         except ValueError as error:
             found.append(f"network.sumocfg: train {d.id}: {error}")
             continue
@@ -154,6 +171,8 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         depart=np.array([max(d.depart_s - traffic.begin_s, 0.0) for d in departures]),
         edge=np.array([rails.index[d.edges[0]] for d in departures], np.int64),
         lane_position=np.array([d.position_m for d in departures]),
+        arrival=np.array(arrival),
+        like=tuple(d.like for d in departures),
         speed=np.array([math.nan if d.speed_mps is None else d.speed_mps for d in departures]),
         top_speed=np.array([traffic.kinds[d.kind].max_speed_mps for d in departures]),
         speed_factor=factor,
@@ -161,6 +180,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         stops=tuple(stops),
         cooperates=together,
         vclass=tuple(traffic.kinds[d.kind].vclass for d in departures),
+        patience=traffic.patience_s,
         notes=traffic.notes,
         rails=rails,
         placed=False,
@@ -208,13 +228,20 @@ def _types(scenario: Scenario, traffic: Traffic) -> tuple[dict[str, TrainType], 
 def _stops(departure: Departure, rails: Rails, way: Ints, begin: Floats, begin_s: float) -> tuple[Stop, ...]:
     """Stops in the order of the way; an edge that is passed more than once has those behind the last place on its next passage."""
     found, row, last = [], 0, departure.position_m
+    normal = np.flatnonzero(~rails.internal[way])
     for stop in departure.stops:
         edge = rails.index[stop.edge]
+        row = max(row, int(normal[stop.first]))
         row += int(way[row] == edge and stop.position_m < last)
         ahead = np.flatnonzero(way[row:] == edge)
         if not len(ahead):
             raise ValueError(f"stop on edge {stop.edge} at {stop.position_m:g} m: lies behind the departure or the stop before")
         row, last = row + int(ahead[0]), stop.position_m
         until = -math.inf if stop.until_s is None else stop.until_s - begin_s
-        found.append(Stop(float(begin[row] + stop.position_m), stop.duration_s, until, stop.name or stop.edge))
+        found.append(Stop(float(begin[row] + stop.position_m), stop.duration_s, until, stop.name or stop.edge, stop.pass_mps))
     return tuple(found)
+
+
+def _before_the_end(stops: tuple[Stop, ...], end: float) -> tuple[Stop, ...]:
+    """Stops with none so near to the end of a way that the train would leave instead: SUMO's own trains stand short of it, too."""
+    return tuple(s if s.passing else s._replace(place=min(s.place, end - STANDS_SHORT_M)) for s in stops)

@@ -37,6 +37,7 @@ class Departure(NamedTuple):
     speed_factor: float  # share of a speed limit that it keeps to
     placed: bool  # whatever SUMO thinks of it
     stops: tuple[Stop, ...]
+    arrival_m: float = np.inf  # where on the last edge it leaves; inf: at its end
 
 
 def verify_signals(p: Prepared) -> None:
@@ -103,7 +104,7 @@ def _coming(p: Prepared) -> list[Departure]:
             id=name, vclass=roster.vclass[i], route=roster.routes[i], position_m=float(roster.lane_position[i]),
             depart=float(roster.depart[i]), speed=None if np.isnan(speed) else speed,
             top_speed=float(roster.top_speed[i]) if top is None else min(top, float(roster.top_speed[i])),
-            speed_factor=float(roster.speed_factor[i]), placed=False, stops=tuple(stops),
+            speed_factor=float(roster.speed_factor[i]), placed=False, stops=tuple(stops), arrival_m=float(roster.arrival[i]),
         ))  # fmt: skip
     return found
 
@@ -121,8 +122,9 @@ def write_routes(p: Prepared, trains: list[Departure], path: Path) -> None:
     ]
     for d, key in sorted(zip(trains, keys, strict=True), key=lambda pair: pair[0].depart):
         given = {
-            "id": d.id, "type": kinds[key], "depart": f"{d.depart:.3f}", "departLane": "0", "departPos": repr(d.position_m),
+            "id": d.id, "type": kinds[key], "depart": f"{d.depart:.3f}", "departLane": "best", "departPos": repr(d.position_m),
             "departSpeed": None if d.speed is None else repr(d.speed), "insertionChecks": "none" if d.placed else None,
+            "arrivalPos": None if np.isinf(d.arrival_m) else repr(d.arrival_m),
         }  # fmt: skip
         lines.append(f'    <vehicle{_words(given)}><route edges="{" ".join(normal(d.route))}"/>')
         for stop in d.stops:

@@ -88,7 +88,7 @@ def _traffic(run: Run, scenario: Scenario, binary: str, from_s: float, delay_ms:
     columns = {"timestep_time": "time_s", "vehicle_id": "train", "vehicle_lane": "lane", "vehicle_pos": "m", "vehicle_speed": "v"}
     try:
         seen = pd.DataFrame(pq.read_table(log, columns=list(columns)).to_pandas()).rename(columns=columns)
-        rails = Rails.read(nets[0])
+        rails = Rails.read(nets[0], set(seen["lane"].dropna().astype(str).str.rpartition("_")[0]))
     except (pa.ArrowException, OSError) as error:
         raise InputError(f"{log}: cannot be read: {str(error).partition(chr(10))[0]}") from None
     except LineError as error:

@@ -22,7 +22,7 @@ import numpy as np
 
 from sumo_net import Line
 from trainctl.errors import CouplingError, SimulatorError
-from trainctl.numeric import lay_out
+from trainctl.numeric import LEAVES_M, lay_out, way_lengths
 from trainctl.railway.ways import Ways, rerouted
 from trainctl.runs.sumo_logs import elements
 from trainctl.signals import Bools, Floats, Ints, Links, Seen, Start
@@ -74,10 +74,6 @@ LOGS = {
 }
 
 
-#: A train whose front is this close to the end of its way has left the net when SUMO's step ends (its POSITION_EPS).
-LEAVES_M = 0.1
-
-
 def write_routes(start: Start, path: Path) -> list[str]:
     """The trains as SUMO vehicles: true lengths and carriages, no randomness, no limits of SUMO's own.
 
@@ -91,9 +87,10 @@ def write_routes(start: Start, path: Path) -> list[str]:
         if not start.present[i]:
             continue
         route = " ".join(normal(start.routes[i]))
+        arrival = arrival_word(np.inf if start.arrival is None else float(start.arrival[i]))
         rows.append(
-            f'    <vehicle id={quoteattr(name)} type="{kinds[-1]}" depart="0" departLane="0" insertionChecks="none"'
-            f' departPos="{float(start.lane_position[i])!r}" departSpeed="{float(start.speed[i])!r}">\n'
+            f'    <vehicle id={quoteattr(name)} type="{kinds[-1]}" depart="0" departLane="best" insertionChecks="none"'
+            f' departPos="{float(start.lane_position[i])!r}" departSpeed="{float(start.speed[i])!r}" arrivalPos="{arrival}">\n'
             f'        <route edges="{route}"/>\n    </vehicle>\n'
         )
     with path.open("w", encoding="utf-8") as out:
@@ -109,6 +106,11 @@ def write_routes(start: Start, path: Path) -> list[str]:
         out.writelines(rows)
         out.write("</routes>\n")
     return kinds
+
+
+def arrival_word(place: float) -> str:
+    """Where a train leaves, as SUMO takes it: at this place of its last edge [m], or at the end."""
+    return "max" if math.isinf(place) else repr(place)
 
 
 def normal(route: Iterable[str]) -> list[str]:
@@ -252,6 +254,7 @@ class Sumo(Session):
         self._plan = _direct(vehicle.setActionStepLength)
         self.ids, self.routes, self.departs_m = list(start.ids), list(start.routes), start.lane_position
         self.ways = lay_out(self.line, start)
+        self.arrival = np.full(len(self.ids), np.inf) if start.arrival is None else start.arrival
         self.way_end = self._way_end()
         self.coming: list[tuple[int, float]] = []
         self._begin(configuration)
@@ -341,8 +344,9 @@ class Sumo(Session):
         name = self.ids[train]
         self._call(self.api.route.add, f"way_{name}", normal(self.routes[train]))
         self._call(
-            self.api.vehicle.add, name, f"way_{name}", typeID=self.kinds[train], depart="now", departLane="first",
+            self.api.vehicle.add, name, f"way_{name}", typeID=self.kinds[train], depart="now", departLane="best",
             departPos=repr(float(self.departs_m[train])), departSpeed=repr(speed),
+            arrivalPos=arrival_word(float(self.arrival[train])),
         )  # fmt: skip
         self.coming.append((train, speed))
 
@@ -382,7 +386,7 @@ class Sumo(Session):
     def _way_end(self) -> Floats:
         """Where the way of each train ends (n,) [m]."""
         last = self.ways.first[1:] - 1
-        return np.asarray(self.ways.begin[last] + self.line.length_m[self.ways.edge[last]])
+        return np.asarray(self.ways.begin[last] + way_lengths(self.ways, self.line, self.arrival))
 
     def _command(self, trains: Ints, speeds: Floats) -> None:
         names = self.ids if len(trains) == len(self.ids) else [self.ids[i] for i in trains.tolist()]

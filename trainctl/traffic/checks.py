@@ -6,15 +6,12 @@ from collections import Counter
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
-from sumo_net.netfile import RAIL
+from sumo_net.netfile import RAIL, NetFile
 from trainctl.errors import InputError
-from trainctl.traffic.duarouter import STOP_KEYS
-from trainctl.traffic.files import PEOPLE, Demand, is_time, routes_of, types_of
+from trainctl.traffic import known
+from trainctl.traffic.files import PEOPLE, PLACES, Demand, is_time, routes_of, types_of
 from trainctl.traffic.kinds import Kind
-from trainctl.traffic.places import Tracks, off_route, place_of, unconnected
-
-#: What a stop may say that changes nothing here.
-_SILENT = {"line", "tripId", "actType", "color", "name", "arrival", "started", "ended", "posLat", "index", "parking"}
+from trainctl.traffic.places import NO_RAIL, Tracks, off_route, place_of, unconnected
 
 
 def rail_trains(demand: Demand, kinds: dict[str, Kind]) -> tuple[list[Element], list[str]]:
@@ -27,28 +24,17 @@ def rail_trains(demand: Demand, kinds: dict[str, Kind]) -> tuple[list[Element], 
         rail = [t for t in types if t not in kinds or kinds[t].vclass in RAIL]
         trains += [train] * bool(rail)
         others += not rail
-    counts = {word: sum(n for tag, n in demand.seen.items() if PEOPLE.get(tag) == word) for word in ("persons", "containers")}
+    counts = Counter(PEOPLE[e.tag] for e in demand.others if e.tag in PEOPLE)
     notes = [f"{n} definitions of {word} left out" for word, n in counts.items() if n]
     notes += [f"{others} vehicles, trips and flows left out: not rail"] if others else []
-    notes += [f"{demand.seen['rerouter']} rerouters not followed"] if demand.seen.get("rerouter") else []
     places = {t.get("departPos", "") for t in trains} & {"random", "free", "random_free", "last", "splitFront"}
     notes += [
         f'departPos="{p}": the train begins with its rear at the beginning of the edge, as with "base"' for p in sorted(places)
     ]
-    speeds = {t.get("departSpeed", "") for t in trains} & {"random", "last", "avg"}
-    notes += [f'departSpeed="{s}": as fast as allowed' for s in sorted(speeds)]
+    if any(t.get("departSpeed") == "random" for t in trains):
+        notes.append('departSpeed="random": as fast as allowed')
     if any(t.get("arrivalPos") == "random" for t in trains):
         notes.append('arrivalPos="random": at the end of the edge')
-    if n := sum(t.get("arrivalSpeed") is not None for t in trains):
-        notes.append(f"{n} trains, trips and flows with an arrivalSpeed: it is not followed")
-    if n := sum(t.get("speedFactor") is not None for t in trains):
-        notes.append(f"{n} trains, trips and flows with a speedFactor of their own: that of the vType holds")
-    routed = {t.get("route", "") for t in trains}
-    stops = [s for t in trains for s in t.iter("stop")] + [
-        s for r in routed & set(demand.routes) for s in demand.routes[r].iter("stop")
-    ]
-    for key in sorted({key for s in stops for key, value in s.items() if value not in ("0", "false")} - STOP_KEYS - _SILENT):
-        notes.append(f"{key} of stops is not followed")
     drawn = {t.get("type", "") for t in trains}
     drawn |= {member for name in drawn & set(demand.mixes) for member in types_of(demand.mixes[name])}
     for name in sorted(drawn & set(kinds)):
@@ -57,8 +43,27 @@ def rail_trains(demand: Demand, kinds: dict[str, Kind]) -> tuple[list[Element], 
     return trains, notes
 
 
-def refuse(sumocfg: Path, trains: list[Element], demand: Demand, kinds: dict[str, Kind], tracks: Tracks) -> None:
+def not_followed(
+    options: dict[str, str], trains: list[Element], demand: Demand, kinds: dict[str, Kind], net: NetFile
+) -> tuple[list[str], list[str]]:
+    """What of the files of a configuration is not followed, one line each; and what is refused."""
+    own = {id(e) for t in trains for e in t.iter()}
+    given = list({id(r): r for t in trains for r in routes_of(t, demand) if id(r) not in own}.values())
+    named = {t.get("type", "DEFAULT_VEHTYPE") for t in trains}
+    named |= {member for name in named & set(demand.mixes) for member in types_of(demand.mixes[name])}
+    types = [e for name, e in demand.types.items() if name in named and kinds[name].vclass in RAIL]
+    stops = {place for t in (*trains, *given) for s in t.iter("stop") for tag in PLACES for place in (s.get(tag),) if place}
+    places = [e for name, e in demand.places.items() if name in stops]
+    notes, refused = known.of_trains([*trains, *given, *types, *places])
+    return [*known.of_options(options), *notes, *known.of_others(demand.others), *known.of_net(net)], refused
+
+
+def refuse(sumocfg: Path, net: Path, trains: list[Element], demand: Demand, kinds: dict[str, Kind], tracks: Tracks) -> None:
     """Refuse trains whose names, types, times, routes or stops cannot be: one line for each mistake."""
+    met = {e for t in trains for key in ("from", "via", "to") for e in t.get(key, "").split()}
+    met |= {e for t in trains for route in routes_of(t, demand) for e in route.get("edges", "").split()}
+    if trains and not tracks.marked and not met & tracks.onward.keys():
+        raise InputError(f"{net}: {NO_RAIL}")
     if not trains:
         raise InputError(f"{sumocfg}: no trains: no vehicle, trip or flow has a vType of a rail class ({', '.join(sorted(RAIL))})")
     wrong = []
@@ -84,7 +89,7 @@ def refuse(sumocfg: Path, trains: list[Element], demand: Demand, kinds: dict[str
             stops = [*route.iter("stop"), *(s for s in train if s.tag == "stop")]
             places = [place_of(s, demand, tracks) for s in stops]
             wrong += [f"{who}: {p.wrong}" for p in places if p.wrong]
-            if not route.get("repeat") and not any(p.wrong for p in places):
+            if not {"repeat", "departEdge", "arrivalEdge"} & {*route.keys(), *train.keys()} and not any(p.wrong for p in places):
                 wrong += [f"{who}: {m}" for m in off_route(tuple(route.get("edges", "").split()), places)]
     if wrong:
         raise InputError(list(dict.fromkeys(wrong)))

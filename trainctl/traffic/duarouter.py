@@ -27,7 +27,7 @@ _TRAIN_KEYS = {
 #: What it needs of a route.
 _ROUTE_KEYS = {"id", "edges", "probability", "repeat", "cycleTime", "refId"}
 #: What it needs of a stop.
-STOP_KEYS = {"lane", "edge", "startPos", "endPos", "friendlyPos", "duration", "until", *PLACES}
+_STOP_KEYS = {"lane", "edge", "startPos", "endPos", "friendlyPos", "duration", "until", "speed", *PLACES}
 
 
 def expand(
@@ -51,7 +51,7 @@ def expand(
         bare = _bare(train, _TRAIN_KEYS)
         for child in train:
             if child.tag == "stop":
-                bare.append(_bare(child, STOP_KEYS))
+                bare.append(_stop(child))
             elif child.tag == "route":
                 bare.append(_route(child))
             elif child.tag == "routeDistribution":
@@ -98,7 +98,15 @@ def _bare(element: Element, keys: set[str]) -> Element:
 
 def _route(route: Element) -> Element:
     bare = _bare(route, _ROUTE_KEYS)
-    bare.extend(_bare(s, STOP_KEYS) for s in route.iter("stop"))
+    bare.extend(_stop(s) for s in route.iter("stop"))
+    return bare
+
+
+def _stop(stop: Element) -> Element:
+    """A stop for duarouter, which does not take one without a duration."""
+    bare = _bare(stop, _STOP_KEYS)
+    if "duration" not in bare.attrib and "until" not in bare.attrib:
+        bare.set("duration", "0")
     return bare
 
 

@@ -35,7 +35,7 @@ class Demand(NamedTuple):
     drawn: dict[str, Element]  # route distributions
     trains: list[Element]
     places: dict[str, Element]
-    seen: dict[str, int]  # how many persons, containers, rerouters
+    others: list[Element]  # persons, rerouters and whatever else there is
 
 
 def parse(path: Path) -> Element:
@@ -70,7 +70,7 @@ def named_files(sumocfg: Path, options: dict[str, str], key: str) -> list[Path]:
 
 def read_demand(files: list[Path]) -> Demand:
     """What route files and additional files say, with the files they include; a name may be given once."""
-    d = Demand({}, {}, {}, {}, [], {}, {})
+    d = Demand({}, {}, {}, {}, [], {}, [])
     named = {"vType": d.types, "vTypeDistribution": d.mixes, "route": d.routes, "routeDistribution": d.drawn}
     wrong = []
     for path in files:
@@ -88,8 +88,8 @@ def read_demand(files: list[Path]) -> Demand:
                         table[name] = e
                     elif e is element:
                         wrong.append(f"{path}: a {tag} has no id")
-            elif tag in PEOPLE or tag == "rerouter":
-                d.seen[tag] = d.seen.get(tag, 0) + 1
+            else:
+                d.others.append(element)
     if wrong:
         raise InputError(list(dict.fromkeys(wrong)))
     return d

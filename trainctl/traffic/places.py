@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
-from sumo_net.netfile import RAIL, read_net
+from sumo_net.netfile import NetFile, for_trains, read_net
 from sumo_net.spec import LineError
 from trainctl.errors import InputError
-from trainctl.traffic.files import PLACES, Demand, bad_time
+from trainctl.traffic.files import PLACES, Demand, bad_number, bad_time, is_time, seconds
+
+#: What is said of a road net.
+NO_RAIL = "has no rail edges: none of its lanes allows a rail class by name, and no route runs over one that lets everybody on"
+
+
+#: How SUMO's files say yes.
+YES = ("1", "true", "yes", "on", "x", "t")
 
 
 class Tracks(NamedTuple):
@@ -18,6 +26,8 @@ class Tracks(NamedTuple):
 
     length: dict[str, float]  # of lanes [m]
     onward: dict[str, set[str]]  # from each edge
+    file: NetFile
+    marked: bool  # it has lanes that allow a rail class by name
 
 
 class Place(NamedTuple):
@@ -34,8 +44,9 @@ def read_tracks(net: Path) -> Tracks:
         file = read_net(net)
     except LineError as error:
         raise InputError(error.mistakes) from None
-    if not any(not RAIL.isdisjoint(lane.get("allow", "").split()) for edge in file.edges for lane in edge.lanes):
-        raise InputError(f"{net}: has no rail edges: none of its lanes allows a rail class by name")
+    normal = [e for e in file.edges if e.attributes.get("function", "normal") == "normal"]
+    if not any(for_trains(lane, anybody=True) for edge in normal for lane in edge.lanes):
+        raise InputError(f"{net}: {NO_RAIL}")
     onward: dict[str, set[str]] = {edge.attributes.get("id", ""): set() for edge in file.edges}
     try:
         length = {lane["id"]: float(lane["length"]) for edge in file.edges for lane in edge.lanes}
@@ -43,7 +54,13 @@ def read_tracks(net: Path) -> Tracks:
             onward.setdefault(c["from"], set()).add(c["to"])
     except (KeyError, ValueError) as error:
         raise InputError(f"{net}: not a SUMO net: a lane or a connection has no {error}") from None
-    return Tracks(length, onward)
+    return Tracks(length, onward, file, any(for_trains(lane) for edge in normal for lane in edge.lanes))
+
+
+def unmarked(edges: Iterable[str], tracks: Tracks) -> list[str]:
+    """Edges of routes that are no track by name, but let everybody on."""
+    lanes = {e.attributes.get("id", ""): e.lanes for e in tracks.file.edges}
+    return [e for e in dict.fromkeys(edges) if not any(for_trains(lane) for lane in lanes.get(e, []))]
 
 
 def place_of(stop: Element, demand: Demand, tracks: Tracks) -> Place:
@@ -64,7 +81,10 @@ def place_of(stop: Element, demand: Demand, tracks: Tracks) -> Place:
     if lane not in tracks.length:
         return Place(lane, 0.0, f"{said}: lane {lane}: not in the net")
     length = tracks.length[lane]
-    said_wrong = [f"{key} = {stop.get(key)}" for key in ("duration", "until") if bad_time(stop.get(key, "0"))]
+    # A duration below 0 is none.
+    said_wrong = [] if is_time(stop.get("duration", "0")) else [f"duration = {stop.get('duration')}"]
+    said_wrong += [f"until = {stop.get('until')}"] if bad_time(stop.get("until", "0")) else []
+    said_wrong += [f"speed = {stop.get('speed')}"] if bad_number(stop.get("speed")) else []
     try:
         position = float(where.get("endPos", length))
     except ValueError:
@@ -73,13 +93,15 @@ def place_of(stop: Element, demand: Demand, tracks: Tracks) -> Place:
     if said_wrong:
         return Place(lane, 0.0, f"{said}: {', '.join(said_wrong)}: must be a number, a time not negative")
     position += length if position < 0 else 0.0
-    if where.get("friendlyPos", "0").lower() in ("1", "true", "yes", "on", "x", "t"):
+    if where.get("friendlyPos", "0").lower() in YES:
         position = min(max(position, 0.0), length)
     # SUMO itself lets a stop be a bit beyond the end.
     if not 0.0 <= position <= length + 0.1:
         return Place(lane, 0.0, f"{said}: endPos = {where.get('endPos')}: off the edge, which is {length:g} m long")
     wrong = ""
-    if not name and stop.get("duration") is None and stop.get("until") is None:
+    ends = seconds(stop.get("duration", "-1")) >= 0 or stop.get("until") is not None
+    triggered = any(stop.get(key, "false").lower() in YES for key in ("triggered", "containerTriggered"))
+    if not name and not ends and not triggered and float(stop.get("speed", "0")) == 0:
         wrong = f"{said}: neither duration nor until"
     return Place(lane, min(position, length), wrong)
 
@@ -92,12 +114,12 @@ def unconnected(edges: list[str], tracks: Tracks) -> list[str]:
     ]
 
 
-def off_route(edges: tuple[str, ...], places: list[Place]) -> list[str]:
-    """Stops that a train does not come to, one after the other."""
+def off_route(edges: tuple[str, ...], places: list[Place], firsts: list[int] | None = None) -> list[str]:
+    """Stops that a train does not come to, one after the other; each on the edge of this number in ``firsts`` or a later one."""
     wrong, at, behind = [], 0, 0.0
-    for place in places:
+    for place, first in zip(places, firsts or [0] * len(places), strict=True):
         edge = place.lane.rpartition("_")[0]
-        start = at + 1 if edges[at : at + 1] == (edge,) and place.position_m < behind else at
+        start = max(at + 1 if edges[at : at + 1] == (edge,) and place.position_m < behind else at, first)
         if edge in edges[start:]:
             at, behind = edges.index(edge, start), place.position_m
         elif edge in edges:

@@ -13,11 +13,25 @@ from xml.etree.ElementTree import Element
 
 from sumo_net.netfile import RAIL
 from trainctl.errors import InputError
-from trainctl.traffic.checks import rail_trains, refuse
+from trainctl.traffic import crossings
+from trainctl.traffic.checks import not_followed, rail_trains, refuse
 from trainctl.traffic.duarouter import expand
-from trainctl.traffic.files import PLACES, Demand, bad_number, is_number, is_time, named_files, read_demand, read_options, seconds
+from trainctl.traffic.files import (
+    PLACES,
+    Demand,
+    bad_number,
+    is_number,
+    is_time,
+    named_files,
+    read_demand,
+    read_options,
+    routes_of,
+    seconds,
+)
 from trainctl.traffic.kinds import Kind, default_types, kind_of
-from trainctl.traffic.places import Tracks, off_route, place_of, read_tracks, unconnected
+from trainctl.traffic.places import YES, Tracks, off_route, place_of, read_tracks, unconnected, unmarked
+from trainctl.traffic.scale import scaled
+from trainctl.traffic.trial import in_doubt, tried
 
 #: What SUMO takes in place of a number; the first is its default.
 _WORDS = {
@@ -25,6 +39,10 @@ _WORDS = {
     "departSpeed": ("max", "desired", "speedLimit", "last", "avg", "random"),
     "arrivalPos": ("max", "random", "center"),
 }
+
+
+#: How fast a train begins of which nothing is said: SUMO's own default since 1.27.
+DEPART_SPEED = "avg"
 
 
 class Stop(NamedTuple):
@@ -35,6 +53,8 @@ class Stop(NamedTuple):
     duration_s: float  # at least
     until_s: float | None  # not before
     name: str  # of the train stop, or ""
+    first: int  # number in the route of the earliest edge it may be on
+    pass_mps: float  # it does not stand, but passes with at most this speed; 0: it stands
 
 
 class Departure(NamedTuple):
@@ -46,6 +66,7 @@ class Departure(NamedTuple):
     edges: tuple[str, ...]  # its route, without internal edges
     position_m: float  # of its front on the first edge
     speed_mps: float | None  # None: as fast as allowed
+    like: str  # "avg": as the trains on its edge on average, "last": as the last of them, and at most as allowed; else ""
     stops: tuple[Stop, ...]
     arrival_m: float | None  # where on the last edge it leaves; None: at its end
     line: str
@@ -60,6 +81,7 @@ class Traffic(NamedTuple):
     begin_s: float
     end_s: float | None
     step_s: float
+    patience_s: float  # after this time trains that could not enter do not come any more; inf: they always do
     notes: tuple[str, ...]  # what is not followed
 
 
@@ -84,7 +106,8 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
     """
     options = read_options(sumocfg)
     net, routes, more = (named_files(sumocfg, options, key) for key in ("net-file", "route-files", "additional-files"))
-    wrong = [f"{sumocfg}: no {key}" for key, files in (("net-file", net), ("route-files", routes)) if not files]
+    wrong = [f"{sumocfg}: no net-file"] if not net else []
+    wrong += [f"{sumocfg}: no route-files, nor additional-files with trains in them"] if not routes and not more else []
     wrong += [f"{sumocfg}: {path}: no such file" for path in (*net, *routes, *more) if not path.is_file()]
     times = {}
     for key, missing in (("begin", "0"), ("end", "-1"), ("step-length", "1")):
@@ -92,12 +115,22 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         times[key] = seconds(said) if is_time(said) else math.nan
         if not (times[key] > 0 if key == "step-length" else math.isfinite(times[key])):
             wrong.append(f"{sumocfg}: {key} = {said}: must be a time{', above 0' if key == 'step-length' else ''}")
+    patience, scale = options.get("max-depart-delay", "-1"), options.get("scale", "1")
+    if not is_time(patience):
+        wrong.append(f"{sumocfg}: max-depart-delay = {patience}: must be a time")
+    if bad_number(scale):
+        wrong.append(f"{sumocfg}: scale = {scale}: must be a number, not negative")
+    speed = options.get("default.departspeed", DEPART_SPEED)
+    if speed not in _WORDS["departSpeed"] and bad_number(speed):
+        wrong.append(f"{sumocfg}: default.departspeed = {speed}: must be a speed or one of {', '.join(_WORDS['departSpeed'])}")
     if wrong:
         raise InputError(wrong)
     begin, own_end = times["begin"], times["end"] if times["end"] >= 0 else None
     ends = [e for e in (own_end, None if duration_s is None else begin + duration_s) if e is not None]
     tracks = read_tracks(net[0])
     demand = read_demand([*more, *routes])
+    if options.get("use-stop-ended", "false").lower() in YES:
+        _ended(demand)
     wrong = [
         f"vType {name}: {key} = {element.get(key)}: must be a number, not negative"
         for name, element in demand.types.items()
@@ -108,7 +141,15 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         raise InputError(wrong)
     kinds = {name: kind_of(element) for name, element in (default_types() | demand.types).items()}
     trains, notes = rail_trains(demand, kinds)
-    refuse(sumocfg, trains, demand, kinds, tracks)
+    more_notes, refused = not_followed(options, trains, demand, kinds, tracks.file)
+    if refused:
+        raise InputError([f"{sumocfg}: {line}" for line in refused])
+    refuse(sumocfg, net[0], trains, demand, kinds, tracks)
+    if float(scale) != 1.0:
+        trains, scale_notes = scaled(trains, float(scale), options.get("scale-suffix", "."))
+        notes += scale_notes
+    if in_doubt(net[0], tracks.file):
+        tried(net[0])
     expanded = expand(trains, demand, net[0], work, begin, min(ends) if ends else None, seed)
     order = {train.get("id", ""): k for k, train in enumerate(trains)}
     made = {vehicle.get("id", "") for vehicle in expanded}
@@ -125,7 +166,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         kind = kinds[vehicle.get("type", "DEFAULT_VEHTYPE")]
         if kind.vclass not in RAIL:
             continue
-        train, mistakes = _departure(vehicle, source, kind, demand, tracks)
+        train, mistakes = _departure(vehicle, source, kind, demand, tracks, speed)
         departures.append((order[source.get("id", "")], train))
         wrong += mistakes
     if wrong:
@@ -135,6 +176,11 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         raise InputError(f"{sumocfg}: no train departs at begin = {begin:g} or later{until}")
     departures.sort(key=lambda d: (d[1].depart_s, d[0]))
     used = {d.kind for _, d in departures}
+    if plain := unmarked((e for _, d in departures for e in d.edges), tracks):
+        notes.append(
+            f"net: {len(plain)} x edges of routes let everybody on, no rail class by name: tracks without their road traffic"
+        )
+    notes += crossings.told(tracks.file, [d.edges for _, d in departures])
     return Traffic(
         net=net[0],
         departures=tuple(d for _, d in departures),
@@ -142,7 +188,8 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         begin_s=begin,
         end_s=own_end,
         step_s=times["step-length"],
-        notes=tuple(notes),
+        patience_s=seconds(patience) if seconds(patience) >= 0 else math.inf,
+        notes=(*notes, *more_notes),
     )
 
 
@@ -159,12 +206,55 @@ def _comes(train: Element, begin: float, end: float) -> bool:
     return sure and begin <= seconds(train.get("begin", "0")) < min(end, seconds(train.get("end", "inf")))
 
 
-def _departure(vehicle: Element, source: Element, kind: Kind, demand: Demand, tracks: Tracks) -> tuple[Departure, list[str]]:
+def _ended(demand: Demand) -> None:
+    """Let trains stand until the time at which their stops are said to have ended, as SUMO does with ``use-stop-ended``."""
+    everything = [*demand.trains, *demand.routes.values(), *demand.drawn.values()]
+    for stop in (stop for element in everything for stop in element.iter("stop")):
+        if (ended := stop.get("ended")) is not None and is_time(ended) and seconds(ended) >= 0:
+            stop.set("until", ended)
+
+
+def _lap(edges: tuple[str, ...], routes: list[Element]) -> tuple[tuple[str, ...], int, int]:
+    """The edges of one lap, how many laps, and the stops of each, of a train that runs over ``edges``.
+
+    duarouter always repeats the stops of a route that is repeated, but not always its edges.
+    """
+    for route in routes:
+        once, repeat = tuple(route.get("edges", "").split()), route.get("repeat", "0")
+        laps = (int(repeat) if repeat.isdecimal() else 0) + 1
+        if edges in (once, once * laps):
+            return once, laps, len(list(route.iter("stop")))
+    return edges, 1, 0
+
+
+def _cut(source: Element, edges: tuple[str, ...], laps: int) -> tuple[int, int] | str:
+    """Numbers of the first edge of a route that a train runs over and of the one behind the last; else what is wrong."""
+    found = []
+    for key, missing in (("departEdge", 0), ("arrivalEdge", len(edges) * laps - 1)):
+        said = source.get(key, str(missing))
+        if said in ("random", "free"):
+            return f"{key} = {said}: is drawn by SUMO; give the number of an edge"
+        if not said.isdecimal() or int(said) >= len(edges) * laps:
+            return f"{key} = {said}: must be the number of an edge of its route, 0 to {len(edges) * laps - 1}"
+        found.append(int(said))
+    first, last = found
+    return (first, last + 1) if first <= last else f"arrivalEdge = {last}: lies before departEdge = {first}"
+
+
+def _departure(
+    vehicle: Element, source: Element, kind: Kind, demand: Demand, tracks: Tracks, default_speed: str
+) -> tuple[Departure, list[str]]:
     """A train out of what duarouter wrote and what the file said, and the mistakes in it."""
     name, route = vehicle.get("id", ""), vehicle.find("route")
     edges = () if route is None else tuple(route.get("edges", "").split())
+    edges, laps, of_lap = _lap(edges, routes_of(source, demand))
+    cut = _cut(source, edges, laps)
+    first, end = (0, len(edges) * laps) if isinstance(cut, str) else cut
+    firsts = [max(k // of_lap * len(edges) - first, 0) if k < laps * of_lap else 0 for k, _ in enumerate(vehicle.iter("stop"))]
+    edges = (edges * laps)[first:end]
     places = [place_of(stop, demand, tracks) for stop in vehicle.iter("stop")]
-    wrong = [f"train {name}: {m}" for m in (*unconnected(list(edges), tracks), *off_route(edges, places))]
+    wrong = [f"train {name}: {m}" for m in (*unconnected(list(edges), tracks), *off_route(edges, places, firsts))]
+    wrong += [f"train {name}: {cut}"] if isinstance(cut, str) else []
     stops = [
         Stop(
             edge=place.lane.rpartition("_")[0],
@@ -172,8 +262,10 @@ def _departure(vehicle: Element, source: Element, kind: Kind, demand: Demand, tr
             duration_s=max(seconds(stop.get("duration", "0")), 0.0),
             until_s=seconds(stop.get("until", "")) if stop.get("until") else None,
             name=next((stop.get(tag, "") for tag in PLACES if stop.get(tag)), ""),
+            first=at,
+            pass_mps=float(stop.get("speed", "0")),
         )
-        for stop, place in zip(vehicle.iter("stop"), places, strict=True)
+        for stop, place, at in zip(vehicle.iter("stop"), places, firsts, strict=True)
     ]
     departure = Departure(
         id=name,
@@ -182,13 +274,14 @@ def _departure(vehicle: Element, source: Element, kind: Kind, demand: Demand, tr
         edges=edges,
         position_m=0.0,
         speed_mps=None,
+        like="",
         stops=tuple(stops),
         arrival_m=None,
         line=source.get("line", ""),
     )
     if wrong:
         return departure, wrong
-    first, last = (tracks.length[f"{e}_0"] for e in (edges[0], edges[-1]))
+    begun, ended = (tracks.length[f"{e}_0"] for e in (edges[0], edges[-1]))
     wrong = [
         f"train {name}: {key} = {source.get(key)}: must be a number or one of {', '.join(known)}"
         for key, known in _WORDS.items()
@@ -198,19 +291,19 @@ def _departure(vehicle: Element, source: Element, kind: Kind, demand: Demand, tr
         wrong.append(f"train {name}: departSpeed = {source.get('departSpeed')}: must not be negative")
     if wrong:
         return departure, wrong
-    position = _depart_position(source.get("departPos", "base"), kind.length_m, first, departure)
+    position = _depart_position(source.get("departPos", "base"), kind.length_m, begun, departure)
     arrival = source.get("arrivalPos", "max")
-    arrival_m = last / 2 if arrival == "center" else None
+    arrival_m = ended / 2 if arrival == "center" else None
     if is_number(arrival):
-        arrival_m = min(max(float(arrival) + (last if float(arrival) < 0 else 0.0), 0.0), last)  # as in SUMO
-    # Without a word of it SUMO lets a train begin as fast as it may (measured; its documentation says 0).
-    speed = source.get("departSpeed", "max")
+        arrival_m = min(max(float(arrival) + (ended if float(arrival) < 0 else 0.0), 0.0), ended)  # as in SUMO
+    speed = source.get("departSpeed", default_speed)
     speed_mps = float(speed) if is_number(speed) else None
-    if not 0.0 <= position <= first:
-        wrong.append(f"train {name}: departPos = {source.get('departPos')}: off edge {edges[0]}, which is {first:g} m long")
+    if not 0.0 <= position <= begun:
+        wrong.append(f"train {name}: departPos = {source.get('departPos')}: off edge {edges[0]}, which is {begun:g} m long")
     if stops and stops[0].edge == edges[0] and position >= stops[0].position_m:
         speed_mps = 0.0
-    return departure._replace(position_m=position, arrival_m=arrival_m, speed_mps=speed_mps), wrong
+    like = speed if speed in ("avg", "last") else ""
+    return departure._replace(position_m=position, arrival_m=arrival_m, speed_mps=speed_mps, like=like), wrong
 
 
 def _depart_position(said: str, length: float, first: float, departure: Departure) -> float:

@@ -1,0 +1,158 @@
+"""What SUMO's files say of a train is done: places, stops and speeds are those of plain SUMO, on both backends alike."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import nets
+import pytest
+import tomli_w
+from beside import followed, plain
+
+from trainctl.runner import run
+from trainctl.runs.run import Run
+from trainctl.scenario.build import open_scenario
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A line of three edges of 3 km."""
+    nodes = {name: (3000.0 * k, 0.0) for k, name in enumerate("abcd")}
+    nets.net(tmp_path, nodes, {"ab": ("a", "b"), "bc": ("b", "c"), "cd": ("c", "d")})
+    return tmp_path
+
+
+@pytest.fixture
+def ring(tmp_path):
+    """A ring of four edges."""
+    nodes = {"a": (0, 0), "b": (2000, 0), "c": (2000, 2000), "d": (0, 2000)}
+    nets.net(tmp_path, nodes, {f"{x}{y}": (x, y) for x, y in ("ab", "bc", "cd", "da")})
+    return tmp_path
+
+
+def events(found: Run, kind: str) -> list[dict[str, Any]]:
+    return [e for e in found.events if e["kind"] == kind]
+
+
+def last_seen(found: Run) -> tuple[str, float]:
+    """Edge and place on it where the only train was seen last."""
+    row = found.trains.sort_values("time_s").iloc[-1]
+    start = {"ab": 0.0, "bc": 3000.0, "cd": 6000.0}[str(row.edge)]
+    return str(row.edge), float(row.position_m) - start
+
+
+def test_a_train_leaves_where_it_is_to_arrive(folder):
+    found = followed(folder, nets.train("v", "ab bc", 0, arrivalPos=1500), 200)
+    [arrived] = events(found, "arrive")
+    edge, place = last_seen(found)
+    assert edge == "bc" and 1500.0 - 36.0 <= place <= 1500.0
+    [trip] = plain(folder, "tripinfo")
+    assert float(trip["arrivalPos"]) == 1500.0
+    assert abs(arrived["time_s"] - 4400.0 / 35.0) < 10.0
+
+
+def test_a_train_that_stops_beyond_its_arrival_leaves_there(folder):
+    stop = '<stop lane="bc_0" endPos="2000" duration="20"/>'
+    found = followed(folder, nets.train("v", "ab bc", 0, stop, arrivalPos=1500), 300)
+    [reached] = events(found, "stop_reached")
+    [halt] = plain(folder, "stop")
+    assert float(halt["pos"]) == 2000.0 and 20.0 <= events(found, "arrive")[0]["time_s"] - reached["time_s"] < 30.0
+
+
+def test_a_stop_at_the_end_of_the_way_is_made(folder):
+    found = followed(folder, nets.train("v", "ab bc", 0, '<stop lane="bc_0" duration="40"/>'), 400)
+    [reached], [left] = events(found, "stop_reached"), events(found, "stop_left")
+    assert left["time_s"] - reached["time_s"] == 40.0 and reached["short_m"] < 1.0
+    assert len(plain(folder, "stop")) == len(events(found, "arrive")) == 1
+
+
+def test_departure_and_arrival_edges_cut_the_route(folder):
+    found = followed(folder, nets.train("v", "ab bc cd", 0, departEdge=1, arrivalEdge=1), 200)
+    assert set(found.trains.edge.astype(str)) == {"bc"}
+    [route] = plain(folder, "tripinfo")
+    assert route["departLane"] == route["arrivalLane"] == "bc_0"
+
+
+def test_a_stop_of_a_repeated_route_is_made_once_a_lap(ring):
+    route = '<route id="r" edges="ab bc cd da" repeat="2"><stop lane="bc_0" endPos="500" duration="10"/></route>'
+    found = followed(ring, route + '<vehicle id="v" type="emu" depart="0" departSpeed="max" route="r"/>', 1700)
+    at = [e["time_s"] for e in events(found, "stop_reached")]
+    sumo = [float(row["started"]) for row in plain(ring, "stop")]
+    assert len(at) == len(sumo) == 3
+    # Plain SUMO drives 45 m/s for 35 m/s of ours, both slowly round the corners.
+    assert all(614.0 < b - a < 614.0 * 1.2 for a, b in pairwise(at)) and sumo[1] - sumo[0] == 614.0
+
+
+def test_a_waypoint_is_passed_slowly_without_a_stand(folder):
+    found = followed(folder, nets.train("v", "ab bc", 0, '<stop lane="ab_0" endPos="2500" speed="10"/>'), 400)
+    [passed] = events(found, "waypoint")
+    assert 8.0 < passed["speed_mps"] <= 10.0 + 1e-6 and not events(found, "stop_reached")
+    before = found.trains[found.trains.position_m < 1500.0]
+    assert before.speed_mps.max() > 30.0 and found.trains.speed_mps.min() > 8.0
+
+
+def test_no_duration_but_a_time_and_the_times_stops_ended(folder):
+    halts = '<stop lane="ab_0" endPos="1000" duration="-1" until="90"/><stop lane="bc_0" endPos="1000" duration="5" ended="300"/>'
+    found = followed(folder, nets.train("v", "ab bc", 0, halts), 400, '<use-stop-ended value="true"/>')
+    assert [e["time_s"] for e in events(found, "stop_left")] == [90.0, 300.0]
+    assert [float(row["ended"]) for row in plain(folder, "stop")] == [90.0, 300.0]
+
+
+@pytest.mark.parametrize(("option", "speed"), [('<default.departspeed value="0"/>', 0.0), ("", 35.0)])
+def test_the_configuration_says_how_fast_trains_begin_else_sumo(folder, option, speed):
+    body = '<vehicle id="v" type="emu" depart="0"><route edges="ab"/></vehicle>'
+    found = followed(folder, body, 50, option, ("sumo",))
+    [came] = events(found, "depart")
+    assert came["speed_mps"] == speed
+    [trip] = plain(folder, "tripinfo")
+    assert (float(trip["departSpeed"]) == 0.0) == (speed == 0.0)
+
+
+@pytest.mark.parametrize(("word", "speed"), [("avg", 7.5), ("last", 5.0)])
+def test_a_train_begins_no_faster_than_those_on_its_edge(folder, word, speed):
+    """Two trains of other types run ahead at their top speeds."""
+    types = nets.EMU + "".join(
+        f'<vType id="{n}" vClass="rail" length="20" maxSpeed="{v}"/>' for n, v in (("quick", 10), ("slow", 5))
+    )
+    body = nets.train("q", "ab bc", 0, type="quick", departPos=2700) + nets.train("s", "ab bc", 1, type="slow", departPos=1400)
+    nets.traffic(folder, body + nets.train("v", "ab bc", 20, departSpeed=word), types)
+    (folder / "s.toml").write_text(tomli_w.dumps(nets.scenario("robust_constrained", 30, ("emu", "quick", "slow"))))
+    found = run(open_scenario(str(folder / "s.toml")), folder / "out", "numeric")
+    [came] = [e for e in events(found, "depart") if e["train"] == "v"]
+    assert came["speed_mps"] == pytest.approx(speed, abs=0.5)
+    [trip] = [row for row in plain(folder, "tripinfo", "--railsignal-moving-block") if row["id"] == "v"]
+    assert float(trip["departSpeed"]) == pytest.approx(speed, abs=0.5)
+
+
+def test_demand_is_scaled(folder):
+    flow = nets.flow("f", "ab", 2, 200)
+    found = followed(folder, flow + nets.train("v", "cd", 5), 700, '<scale value="2"/>', ("sumo",))
+    came = {e["train"] for e in events(found, "depart")}
+    assert came == {row["id"] for row in plain(folder, "tripinfo")} == {"f.0", "f.1", "f.2", "f.3", "v", "v.1"}
+
+
+def test_who_waits_too_long_does_not_come(folder):
+    body = nets.train("v", "ab", 0, departSpeed=0) + "".join(nets.train(n, "ab", 1) for n in "wx")
+    found = followed(folder, body, 200, '<max-depart-delay value="20"/>', ("numeric",))
+    given_up = [e["train"] for e in events(found, "given_up")]
+    assert given_up and {e["train"] for e in events(found, "depart")} | set(given_up) == {"v", "w", "x"}
+    assert events(found, "not_entered")[0]["trains"] == given_up
+    assert all(e["delay_s"] <= 20.0 for e in events(found, "depart"))
+
+
+def test_trains_may_stand_in_additional_files_alone(folder):
+    nets.traffic(folder, nets.train("v", "ab", 0))
+    text = (folder / "a.sumocfg").read_text().replace("route-files", "additional-files")
+    (folder / "a.sumocfg").write_text(text)
+    (folder / "s.toml").write_text(tomli_w.dumps(nets.scenario("robust_constrained", 20)))
+    assert open_scenario(str(folder / "s.toml")).scenario.ids == ("v",)
+
+
+def test_what_is_not_followed_is_in_the_events_and_on_the_page(folder):
+    found = followed(folder, nets.train("v", "ab", 0, flavour="sweet"), 20, "", ("numeric",))
+    [said] = events(found, "not_followed")
+    assert said["what"] == "1 x <vehicle flavour>: not followed: it is not known here"
+    from trainctl.report.page import page
+
+    assert "1 x &lt;vehicle flavour&gt;: not followed" in page(found)

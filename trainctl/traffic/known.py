@@ -1,0 +1,284 @@
+"""What is known of a SUMO configuration and its files: what is followed, and what is named or refused instead, in which words.
+
+The tables below decide. What stands in none of them is named too, so that nothing is passed over without a word.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
+
+from sumo_net.netfile import NetFile
+
+#: Why what nobody thought of is not followed.
+UNKNOWN = "it is not known here"
+
+
+class Refused(NamedTuple):
+    """Why a configuration with this in it is not run."""
+
+    why: str
+
+
+def _words(*lines: str) -> frozenset[str]:
+    return frozenset(word for line in lines for word in line.split())
+
+
+#: Values that switch something off, or are what it is anyway.
+OFF = frozenset(("", "0", "false", "False", "off", "no", "-1", "none", "0.0", "0.00"))
+
+#: Options that are followed.
+OPTIONS = _words(
+    "net-file route-files additional-files begin end scale scale-suffix max-depart-delay use-stop-ended",
+    "default.departspeed",
+)
+
+#: Options that cannot change the run of a train: what is written, drawn and checked, and how fast SUMO itself runs.
+OPTIONS_OF_NO_EFFECT = _words(
+    "verbose v print-options help version xml-validation xml-validation.net xml-validation.routes no-warnings W suppress-warnings",
+    "aggregate-warnings log l message-log error-log language no-step-log step-log.period duration-log.disable",
+    "duration-log.statistics t no-duration-log output-prefix output-suffix precision precision.geo human-readable-time threads",
+    "route-steps gui-settings-file g quit-on-end Q start S delay d game breakpoints remote-port num-clients demo registry-viewport",
+    "window-size window-pos tracker-interval gui-testing save-configuration C save-template save-schema save-commented",
+    "no-internal-links duration-log netstate-dump netstate netstate-dump.empty-edges summary tripinfo",
+    "save-state.times save-state.period save-state.files save-state.prefix save-state.suffix",
+    "ignore-accidents check-accidents pedestrian.model emissions.volumetric-fuel write-license error-log.append crs",
+    "load-state.offset load-state.remove-vehicles",
+)
+
+#: Options that are not followed: in which words, and the values with which they mean nothing.
+OPTIONS_NAMED: Mapping[str, tuple[str, frozenset[str]]] = {
+    "step-length": ("the step is run.step_s of the scenario", frozenset()),
+    "seed": ("what is drawn is drawn with a seed of its own", frozenset()),
+    "random": ("what is drawn is drawn with a seed of its own", OFF),
+    "default.departlane": ("trains begin on a lane that allows them and leads on", _words("best_prob best first 0 allowed free")),
+    "default.departpos": ("a train without departPos begins with its rear at the beginning of the edge", _words("base")),
+    "default.speeddev": ("no speed is drawn", OFF),
+    "time-to-teleport": ("trains are never teleported", OFF | {"-1", "300"}),
+    "time-to-teleport.highways": ("trains are never teleported", OFF),
+    "time-to-teleport.bidi": ("trains are never teleported", OFF),
+    "time-to-teleport.railsignal-deadlock": ("trains are never teleported", OFF),
+    "time-to-teleport.disconnected": ("trains are never teleported", OFF),
+    "collision.action": ("trains that collide stay where they are, and the run fails", _words("warn none")),
+    "collision.mingap-factor": ("trains collide where they overlap", _words("0")),
+    "collision.check-junctions": ("it is always on", _words("true 1 on yes")),
+    "step-method.ballistic": ("the scenario's plants move the trains", OFF),
+    "default.action-step-length": ("trains are commanded in every step", OFF),
+    "default.carfollowmodel": ("the scenario's law drives the trains", frozenset()),
+    "default.emergencydecel": ("the scenario's supervisor brakes the trains", frozenset()),
+    "use-stop-started": ("a stop begins when the train stands", OFF),
+    "railsignal-moving-block": ("trains are kept apart in moving block anyway", OFF),
+    "device.rerouting.probability": ("trains keep their routes", OFF),
+    "device.rerouting.explicit": ("trains keep their routes", OFF),
+    "ignore-route-errors": ("routes must be connected", OFF),
+    "max-num-vehicles": ("all trains come", OFF),
+    "insertion-checks": ("a train enters when it can do so safely", frozenset()),
+    "eager-insert": ("a train enters when it can do so safely", OFF),
+    "random-depart-offset": ("trains depart when they are to", OFF),
+    "load-state": ("trains begin as their routes say", OFF),
+}  # fmt: skip
+
+#: Elements of route and additional files, with the attributes of them that are followed.
+ELEMENTS: Mapping[str, frozenset[str]] = {
+    "vehicle": (_train := _words(
+        "id type depart route line departPos departSpeed departEdge arrivalEdge arrivalPos begin end period number vehsPerHour",
+        "perHour probability from to via fromJunction toJunction viaJunctions",
+    )),
+    "trip": _train,
+    "flow": _train,
+    "route": _words("id edges probability repeat cycleTime refId"),
+    "routeDistribution": _words("id routes probabilities last"),
+    "vTypeDistribution": _words("id vTypes probabilities"),
+    "stop": _words(
+        "lane edge startPos endPos friendlyPos duration until ended trainStop busStop containerStop parkingArea chargingStation",
+        "overheadWireSegment speed",
+    ),
+    "vType": _words(
+        "id vClass length maxSpeed speedFactor probability carFollowModel trainType mass maxPower maxTraction resCoef_constant",
+        "resCoef_linear resCoef_quadratic massFactor decel",
+    ),
+    **dict.fromkeys(
+        ("trainStop", "busStop", "containerStop", "chargingStation", "overheadWireSegment"),
+        _words("id lane startPos endPos friendlyPos"),
+    ),
+    "parkingArea": _words("id lane startPos endPos friendlyPos"),
+}  # fmt: skip
+
+#: Attributes that cannot change the run of a train.
+OF_NO_EFFECT: Mapping[str, frozenset[str]] = {
+    "vehicle": (_drawn := _words(
+        "color imgFile personNumber containerNumber personCapacity containerCapacity departPosLat arrivalPosLat",
+    )),
+    "trip": _drawn,
+    "flow": _drawn,
+    "route": _words("color cost period savings exitTimes type"),
+    "stop": _words(
+        "line tripId actType color name arrival posLat permitted expected expectedContainers",
+    ),
+    "vType": _words(
+        "color width height guiShape imgFile osgFile emissionClass carriageLength locomotiveLength carriageGap personCapacity",
+        "containerCapacity boardingDuration loadingDuration laneChangeModel maxSpeedLat latAlignment minGapLat",
+        "manoeuverAngleTimes manufacturer parkingBadges",
+    ),
+    **dict.fromkeys(
+        ("trainStop", "busStop", "containerStop", "chargingStation", "overheadWireSegment", "parkingArea"),
+        _words("name lines color personCapacity parkingLength group access angle width length roadsideCapacity onRoad",
+               "power efficiency chargeInTransit chargeDelay chargeType"),
+    ),
+}  # fmt: skip
+
+#: Attributes that are not followed: in which words, and the values with which they mean nothing.
+NAMED: Mapping[tuple[str, str], tuple[str, frozenset[str]] | Refused] = {
+    **{
+        (tag, key): said
+        for tag in ("vehicle", "trip", "flow")
+        for key, said in {
+            "arrivalSpeed": ("trains leave as fast as they come", _words("current")),
+            "speedFactor": ("that of the vType holds", frozenset()),
+            "insertionChecks": ("a train enters when it can do so safely", _words("all")),
+            "departLane": ("trains begin on a lane that allows them and leads on", _words("0 first free allowed best best_prob")),
+            "arrivalLane": ("trains arrive on any lane", _words("current first")),
+            "reroute": ("trains keep their routes", OFF),
+            "fromTaz": ("trips between zones have no route here", frozenset()),
+            "toTaz": ("trips between zones have no route here", frozenset()),
+        }.items()
+    },
+    ("stop", "parking"): ("a train that is to park stays on its track, and others wait for it", OFF),
+    ("stop", "triggered"): ("nobody boards; a train stands as long as duration and until say", OFF),
+    ("stop", "containerTriggered"): ("nothing is loaded; a train stands as long as duration and until say", OFF),
+    ("stop", "join"): Refused("trains are not joined; take the stop and the train that joins out of the files"),
+    ("stop", "split"): Refused("trains are not split; take the stop's split and the train it names out of the files"),
+    ("stop", "jump"): Refused("a train cannot jump to its next edge; give it a route there"),
+    ("stop", "jumpUntil"): ("trains do not jump", OFF),
+    ("stop", "started"): ("a stop begins when the train stands", OFF),
+    ("stop", "onDemand"): ("nobody waits or boards; the train stops", OFF),
+    ("stop", "index"): ("stops are made in the order of the file", _words("end fit")),
+    ("stop", "extension"): ("nobody is waited for", OFF),
+    ("vType", "scale"): ("every train of it comes once", _words("1 1.0 1.00")),
+    **{
+        ("vType", key): ("train type and law of the scenario drive the train", frozenset[str]())
+        for key in ("accel", "emergencyDecel", "apparentDecel", "tau", "sigma", "minGap", "speedDev", "actionStepLength",
+                    "desiredMaxSpeed", "startupDelay", "impatience", "timeToTeleport", "curveResistance")
+    },
+}  # fmt: skip
+
+#: Whole elements of route and additional files that are not followed, in which words.
+ELEMENTS_NAMED: Mapping[str, str | Refused] = {
+    "rerouter": "trains keep their routes",
+    "variableSpeedSign": "the speed limits of the net hold all the time",
+    "calibrator": "no train is let in or taken out by it",
+    "railSignalConstraints": "trains go first come, first served",
+    "tlLogic": "signals are not obeyed; our own interlocking keeps trains apart",
+    "WAUT": "signals are not obeyed; our own interlocking keeps trains apart",
+    "wautJunction": "signals are not obeyed; our own interlocking keeps trains apart",
+    "vaporizer": "nobody is taken out by it",
+    "overheadWire": "overhead wires are not modelled",
+    "tractionSubstation": "overhead wires are not modelled",
+    "taz": "trips between zones have no route here",
+    "tazs": "trips between zones have no route here",
+    "interval": "flows between edges or zones have no route here",
+    "relation": "they say nothing of a train here",
+    "deadlock": "our own interlocking keeps trains apart",
+    "closeLane": "no lane is closed", "closingReroute": "no edge is closed", "closingLaneReroute": "no lane is closed",
+}  # fmt: skip
+
+#: Elements that cannot change the run of a train: outputs, drawings, and what belongs to roads.
+ELEMENTS_OF_NO_EFFECT = _words(
+    "poly poi location type include param inductionLoop e1Detector instantInductionLoop laneAreaDetector e2Detector",
+    "entryExitDetector e3Detector edgeData laneData routeProbe vTypeProbe timedEvent access edgeRelations edges dataSource",
+    "person personFlow container containerFlow",  # counted: see ``checks``
+)
+
+#: Elements of a net.
+NET_ELEMENTS = _words("location type edge junction connection prohibition roundabout param")
+#: Attributes of edges, lanes and connections that matter, and those that only draw.
+NET_EDGE = _words("id from to priority type function bidi distance spreadType shape name length crossingEdges routingType")
+NET_LANE = _words(
+    "id index allow disallow speed length width shape endOffset customShape type acceleration outlineShape changeLeft changeRight",
+)
+NET_CONNECTION = _words(
+    "from to fromLane toLane via dir state tl linkIndex linkIndex2 pass keepClear contPos visibility shape uncontrolled length",
+    "speed customLength allow disallow changeLeft changeRight indirect fringe",
+)
+
+
+def of_options(options: Mapping[str, str]) -> list[str]:
+    """What options of a configuration are not followed, one line each."""
+    lines = []
+    for key, value in options.items():
+        if key in OPTIONS or key in OPTIONS_OF_NO_EFFECT or "output" in key or key.startswith(("gui", "emissions.", "pedestrian.")):
+            continue
+        words, idle = OPTIONS_NAMED.get(key, (UNKNOWN, frozenset()))
+        if value not in idle:
+            lines.append(f"option {key} = {value}: not followed: {words}")
+    return lines
+
+
+def of_trains(elements: Iterable[Element]) -> tuple[list[str], list[str]]:
+    """What the elements of trains, routes, stops and types say that is not followed, and what is refused.
+
+    There is one line for each reason: attributes with the same reason share it, each with how often it stands there.
+    """
+    found = Counter(said for element in elements for one in element.iter() for said in _of_one(one))
+    named: dict[str, list[str]] = {}
+    refused: dict[str, list[str]] = {}
+    for (what, said), n in found.items():
+        lines, why = (refused, said.why) if isinstance(said, Refused) else (named, said)
+        lines.setdefault(why, []).append(f"{n} x <{what}>")
+    return (
+        [f"{', '.join(those)}: not followed: {why}" for why, those in named.items()],
+        [f"{', '.join(those)}: {why}" for why, those in refused.items()],
+    )
+
+
+def _of_one(element: Element) -> Iterator[tuple[str, str | Refused]]:
+    """What of one element is not followed, with the reason."""
+    tag = element.tag
+    if tag == "param" or tag.startswith("carFollowing-"):
+        return
+    if tag not in ELEMENTS:
+        yield tag, UNKNOWN
+        return
+    for key, value in element.items():
+        if key in ELEMENTS[tag] or key in OF_NO_EFFECT.get(tag, ()) or (tag == "vType" and key.startswith(("lc", "jm"))):
+            continue
+        said = NAMED.get((tag, key), (UNKNOWN, frozenset[str]()))
+        if isinstance(said, Refused):
+            yield f"{tag} {key}", said
+        elif value not in said[1]:
+            yield f"{tag} {key}", said[0]
+
+
+def of_others(elements: Iterable[Element]) -> list[str]:
+    """What elements beside trains, routes, stops and types are not followed, one line for each kind."""
+    counts = Counter(e.tag for e in elements if e.tag not in ELEMENTS and e.tag not in ELEMENTS_OF_NO_EFFECT)
+    lines = []
+    for tag, n in counts.items():
+        words = ELEMENTS_NAMED.get(tag, UNKNOWN)
+        lines.append(f"{n} x <{tag}>: not followed: {words}")
+    return lines
+
+
+def of_net(net: NetFile) -> list[str]:
+    """What a net says that is not followed, one line for each."""
+    counts = Counter(_unknown(net))
+    lines = [f"net: {n} x {what}: not followed: {UNKNOWN}" for what, n in counts.items()]
+    signals = sum(j.attributes.get("type") == "rail_signal" for j in net.junctions)
+    if signals:
+        lines.append(f"net: {signals} x rail signals: not obeyed: our own interlocking keeps trains apart in moving block")
+    lights = sum(j.attributes.get("type", "").startswith("traffic_light") for j in net.junctions)
+    if lights:
+        lines.append(f"net: {lights} x traffic lights: not obeyed")
+    return lines
+
+
+def _unknown(net: NetFile) -> Iterator[str]:
+    for edge in net.edges:
+        yield from (f"<edge {key}>" for key in edge.attributes.keys() - NET_EDGE)
+        for lane in edge.lanes:
+            yield from (f"<lane {key}>" for key in lane.keys() - NET_LANE)
+    for connection in net.connections:
+        yield from (f"<connection {key}>" for key in connection.keys() - NET_CONNECTION)
+    yield from (f"<{tag}>" for tag in net.others if tag not in NET_ELEMENTS and tag != "tlLogic")
