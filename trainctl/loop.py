@@ -66,7 +66,7 @@ class Loop(Steps):
         self.disturbances = disturbance.prepare(p.scenario.disturbance, p.scenario.ids, run.step_s, run.seed, p.worst)
         self.orders, self.traffic = orders.Orders(p, journal), traffic.Traffic(p, journal)
         self.topology = topology.Topology(p, journal)
-        self.control, self.driver, self.plant = control.Control(p), driver.Driver(p), plant.of(p)
+        self.control, self.driver, self.plant = control.Control(p), driver.of(p), plant.of(p)
         self.protect = protect.Protect(p, journal, bool(len(self.disturbances.whole)) or self.plant.noisy)
         rule, formed = self.topology.rule.initial()
         self.state = State(
@@ -126,7 +126,7 @@ class Loop(Steps):
             return moved if around.view is None else self._held(moved, own, stands | (speed <= 0.0) & (ordered <= 0.0), here)
 
         moved, acts = self.protect.step(
-            t, around.view, own, acceleration, driven, stands, acting, units, s.watch.acting, over_the_step
+            t, around.view, own, acceleration, self.plant.swing(own), driven, stands, acting, units, s.watch.acting, over_the_step
         )  # fmt: skip
         self._check(t, moved)
 
@@ -185,11 +185,10 @@ class Loop(Steps):
             length=p.consists.train_length(), unit_length=[p.consists.length[a:b] for a, b in pairwise(first)],
             routes=p.roster.routes, present=s.traffic.came.copy(), vclass=p.roster.vclass, arrival=p.roster.arrival,
         )  # fmt: skip
-        if not p.placed:
+        if due := self.traffic.due(0.0, s.traffic):
             ways = lay_out(p.line, start)
             row = ways.first[:-1]
             nobody = Seen(ways.begin[row] + start.lane_position, ways.edge[row], row, start.present)
-            due = self.traffic.due(0.0, s.traffic)
             going, _, entries, _ = self.traffic.entering(0.0, ways, nobody, speed.copy(), s.traffic, due)
             for i, v in entries:
                 start.present[i], start.speed[i] = True, v
@@ -213,11 +212,11 @@ class Loop(Steps):
 
     def _climb(self, own: Floats, formed: Formed, ways: Any, here: Seen) -> None:
         """Tell the plant the slope of the net under every unit; that of a line it knows by the kilometrage."""
-        if self.p.placed or not self.p.rails.slope.any():
+        if not self.p.net_slope.any():
             return
         first = self.p.consists.first
         places = own[:, POSITION] - np.repeat(formed.offset, np.diff(first))
-        self.plant.climbs(under(ways, self.p.rails.slope, here.row, first, places))
+        self.plant.climbs(under(ways, self.p.net_slope, here.row, first, places))
 
     def _held(self, moved: plant.Moved, own: Floats, stands: Bools, here: Seen) -> plant.Moved:
         """Trains that stand, or are not there, stay as they are; a stand ordered is one, rounding aside."""

@@ -217,7 +217,7 @@ def compared() -> dict[str, Example]:
     return {
         "asymptotic": Example().run(800.0),
         "none": Example(observer_params=asymptotic.Params(compensate=False)).run(800.0),
-        "intermediate": Example(observer=intermediate).run(800.0),
+        "intermediate": Example(observer="intermediate").run(800.0),
     }
 
 
@@ -230,7 +230,7 @@ def test_between_window_edges_the_asymptotic_observer_is_far_better(compared):
 
 def test_noise_turns_the_comparison_round():
     """The other direction: with the noise the asymptotic observer (one pole of -3, five times) ripples more than the intermediate."""
-    runs = {o.__name__: Example(observer=o, seed=1).run(600.0) for o in (asymptotic, intermediate)}
+    runs = {o: Example(observer=o, seed=1).run(600.0) for o in ("asymptotic", "intermediate")}
     asymptotic_, intermediate_ = runs.values()
     assert asymptotic_.inside and intermediate_.inside
     assert asymptotic_.ripple()[1] > 2.0 * intermediate_.ripple()[1]
@@ -269,7 +269,7 @@ def test_tables_of_the_comparison(seed, capsys):
         "asymptotic": Example(seed=seed), "none": Example(seed=seed, observer_params=asymptotic.Params(compensate=False)),
         **{
             f"intermediate L = ({a:g}, {b:g}), kappa = {k:g}": Example(
-                seed=seed, observer=intermediate, observer_params=intermediate.Params(L1_per_s=a, L2_per_s2=b, kappa_per_s=k)
+                seed=seed, observer="intermediate", observer_params=intermediate.Params(L1_per_s=a, L2_per_s2=b, kappa_per_s=k)
             )
             for a, b, k in ((6.0, 9.0, 50.0), (6.0, 9.0, 5.0), (20.0, 100.0, 50.0))
         },

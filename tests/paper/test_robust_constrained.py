@@ -302,11 +302,24 @@ def test_assumption_2_needs_weights_of_millionths() -> None:
 
 def test_system_matrix_is_not_stochastic_yet_the_spread_falls() -> None:
     """(16) along the undisturbed example with c = 2/h: negative elements for 55 steps, so Lemma 2 does not explain why it works."""
-    negative, least, rho2_least, spreads = along_the_example()  # which asserts (12) in every step
+    scaled = along_the_example()  # which asserts (12) in every step
+    negative, least = scaled.negative(2 / 0.3)
     assert negative == 55
     assert least == pytest.approx(-0.116, abs=1e-3)
-    assert rho2_least == pytest.approx(0.034, abs=1e-3)
-    assert np.all(np.diff(spreads) <= 1e-9)
+    assert scaled.rho2.min() == pytest.approx(0.034, abs=1e-3)
+    assert np.all(np.diff(scaled.spreads(2 / 0.3)) <= 1e-9)
+
+
+def test_negative_elements_are_those_of_the_matrix_written_out() -> None:
+    """Sheet (14): lower left (1 - T/c - rho1 (1 - rho2 h T)) I - c T rho1 rho2 L, for one step and several c."""
+    scaled, k = along_the_example(CYCLE), 3
+    for c in (1.0, 2 / 0.3, 100.0):
+        own = scaled.rho1[k] * (1 - scaled.rho2[k] * 0.3 * T)
+        lower_left = np.diag(1 - T / c - own) - c * T * np.diag(scaled.rho1[k] * scaled.rho2[k]) @ scaled.laplacian
+        least = min(1 - T / c, T / c, lower_left.min(), (T / c + own).min())
+        assert scaled._replace(**{n: getattr(scaled, n)[k : k + 1] for n in ("rho1", "rho2")}).negative(c)[1] == pytest.approx(
+            least
+        )
 
 
 # --- stability -------------------------------------------------------------------------------------------------------------------

@@ -352,7 +352,7 @@ def test_ratchet_admits_any_join_without_breaking_a_sound_edge(cases: int) -> No
     sound = literal.edges[:old] > 1e-6
     assert len(np.unique(e.case[:old][sound])) > 0.2 * cases
     assert literal.edges[:old].max() > 100.0
-    assert literal.speed.max() > 100.0
+    assert literal.speed.max() > V_R, "beyond its band by more than the reference speed, though no train runs backwards"
 
 
 def test_lost_messages_break_no_bound_if_the_train_holds() -> None:

@@ -19,8 +19,9 @@ import pytest
 #: Unsupervised trains run at 1e300 m/s.
 wild = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 
-#: Seeds of the part that always runs.
-ALWAYS, ALWAYS_OFF, ALWAYS_SUMO = range(60), range(24), range(4)
+#: Seeds of the part that always runs: every net, every way to do harm, with and without clamps, steps of 0.2 .. 10 s.
+ALWAYS = (0, 5, 6, 10, 13, 14, 15, 17, 18, 19, 21, 23, 25, 27, 29, 34, 38, 40, 42, 50, 51, 53, 56, 57)
+ALWAYS_OFF, ALWAYS_SUMO = range(16), (0, 10, 17)
 
 #: Seeds of the campaign. Those of SUMO are others, and as many run with the supervisor off.
 CAMPAIGN, CAMPAIGN_SUMO, CAMPAIGN_OFF = range(10_000, 13_000), range(20_000, 20_200), range(10_000, 10_300)

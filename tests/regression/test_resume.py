@@ -127,7 +127,7 @@ def test_a_killed_run_of_units_ends_as_if_it_had_not_been(share, reference, tmp_
         ("fault_tolerant_noise", {"run.duration_s": 20, "topology.communication_period_s": 0.5, "run.record_every_s": 2.0}),
         ("emu_group_reroute", {"run.duration_s": 12}),
         ("robust_three_tracks", {"run.duration_s": 60}),
-        ("three_tracks", {"run.duration_s": 120, "supervisor.mode": "on", "supervisor.margin_m": 1900.0}),
+        ("three_tracks", {"run.duration_s": 120, "supervisor.mode": "on", "supervisor.greatest_mps2": 0.05}),
     ],
 )
 def test_every_law_resumes_from_any_step(name, settings, tmp_path):

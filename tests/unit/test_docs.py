@@ -32,6 +32,7 @@ PAGES = (
     "scenarios/README.md",
     "sumo_net/README.md",
     "sumo_net/OSM.md",
+    "trainctl/claims/README.md",
     "trainctl/controllers/README.md",
     "trainctl/diff/README.md",
 )

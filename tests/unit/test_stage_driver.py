@@ -9,8 +9,9 @@ from staged import Told, around, chained, prepared, target, view
 
 from trainctl.railway.supervisor import TRAIN, Limits
 from trainctl.scenario.build import open_scenario
+from trainctl.stages import driver
 from trainctl.stages.convoys import Convoys
-from trainctl.stages.driver import HASTE, ROOM_FOR_HASTE, Driver
+from trainctl.stages.driver import HASTE, ROOM_FOR_HASTE
 from trainctl.stages.traffic import Traffic, nothing
 from trainctl.topology.convoys import closing_speed
 
@@ -27,7 +28,7 @@ class Cab:
 
     def __init__(self, p, speed=35.0):
         self.p, self.n = p, len(p.scenario.ids)
-        self.driver, self.traffic = Driver(p), Traffic(p, Told()).initial()
+        self.driver, self.traffic = driver.of(p), Traffic(p, Told()).initial()
         self.formed = Convoys(p, Told()).initial()[1]
         self.v, self.nobody = np.full(self.n, speed), np.full(self.n, np.nan)
 
@@ -50,7 +51,7 @@ def test_trains_on_a_line_are_driven_by_their_law():
     p = open_scenario("three_tracks")
     n = len(p.scenario.ids)
     formed = object()
-    driven, same = Driver(p).step(np.full(n, 80.0), np.zeros(n), nothing(n), None, formed, np.full(n, 0.3))
+    driven, same = driver.of(p).step(np.full(n, 80.0), np.zeros(n), nothing(n), None, formed, np.full(n, 0.3))
     assert np.isnan(driven.ordered).all() and not driven.stands.any() and same is formed
 
 

@@ -73,7 +73,17 @@ class Track:
         self.tried.clear()
         driven = Driven(np.full(N, np.nan), np.zeros(N, bool))
         moved, self.acting = self.protect.step(
-            t, at, self.own, np.zeros(N), driven, self.stands, self.disturbed, self.state, self.acting, self.over_the_step
+            t,
+            at,
+            self.own,
+            np.zeros(N),
+            np.zeros(N),
+            driven,
+            self.stands,
+            self.disturbed,
+            self.state,
+            self.acting,
+            self.over_the_step,
         )
         return moved.motion.asked
 

@@ -49,7 +49,7 @@ def test_what_keeps_a_train_from_starting():
     rules, stops = supervisor.Params(mode="on", margin_m=30.0), np.array([False, False, False, True])
 
     def found(speed):
-        return waiting.waits(view, held, here, np.array(speed), rules, 1.0, 0.5, stops)
+        return waiting.waits(view, held, here, np.array(speed), rules, supervisor.as_ordered(1.0, 4), 1.0, 0.5, stops)
 
     assert found([0.0, 0.0, 0.0, 0.0]) == [Wait(1, 2, 6, TRAIN), Wait(0, 1, 7, SWITCH)]
     assert found([3.0, 0.0, 0.0, 0.0]) == [Wait(1, 2, 6, TRAIN)]
@@ -57,31 +57,30 @@ def test_what_keeps_a_train_from_starting():
 
 
 def test_a_circle_is_told_once_and_another_one_too():
-    state = Waiting("ABCD", ("e",), 600.0)
-    both = waits((0, 1), (1, 0))
-    (told,) = state.new(5.0, both, {})
+    watch = Waiting("ABCD", ("e",), 600.0)
+    s, both = watch.initial(), waits((0, 1), (1, 0))
+    (told,) = watch.new(5.0, both, {}, s)
     assert told == ("gridlock", {"trains": ["A", "B"], "waits": [
         {"train": "A", "other": "B", "edge": "e", "place": "switch"}, {"train": "B", "other": "A", "edge": "e", "place": "switch"},
     ]})  # fmt: skip
-    assert list(state.new(6.0, both, {})) == []
-    again = Waiting("ABCD", ("e",), 600.0)
-    again.restore(state.values(), state.arrays())
-    assert list(again.new(7.0, both, {})) == []
-    assert [kind for kind, _ in again.new(8.0, both + waits((2, 3), (3, 2)), {})] == ["gridlock"]
-    assert (len(state.circles), len(again.circles)) == (1, 2)
+    assert list(watch.new(6.0, both, {}, s)) == []
+    assert [kind for kind, _ in watch.new(8.0, both + waits((2, 3), (3, 2)), {}, s)] == ["gridlock"]
+    assert s.counted["circles"] == [[0, 1], [2, 3]]
 
 
 def test_a_long_wait_is_told_once_and_the_next_one_again():
-    state, wait = Waiting("AB", ("e", "f"), 100.0), [Wait(0, 1, 1, TRAIN)]
-    told = [(t, kind, fields) for t in range(0, 400) for kind, fields in state.new(float(t), wait if t != 150 else [], {})]
+    watch, wait = Waiting("AB", ("e", "f"), 100.0), [Wait(0, 1, 1, TRAIN)]
+    s = watch.initial()
+    told = [(t, kind, fields) for t in range(0, 400) for kind, fields in watch.new(float(t), wait if t != 150 else [], {}, s)]
     assert [(t, kind, fields["since_s"]) for t, kind, fields in told] == [(101, "waiting", 0.0), (252, "waiting", 151.0)]
     assert told[0][2] == {"train": "A", "other": "B", "edge": "f", "place": "train", "since_s": 0.0}
-    assert state.long == 2
+    assert s.counted["long"] == 2
 
 
 def test_a_train_that_cannot_enter_waits_since_it_was_due():
-    state = Waiting("AB", ("e",), 100.0)
-    told = [t for t in range(50, 300) for _ in state.new(float(t), [Wait(1, -1, 0, "entry")], {1: 30.0})]
+    watch = Waiting("AB", ("e",), 100.0)
+    s = watch.initial()
+    told = [t for t in range(50, 300) for _ in watch.new(float(t), [Wait(1, -1, 0, "entry")], {1: 30.0}, s)]
     assert told == [131]
 
 
@@ -90,7 +89,7 @@ def test_a_train_that_cannot_enter_waits_since_it_was_due():
     [(False, 1, 0, []), (True, 1, 0, ["overspeed"]), (True, 0, 0, []), (False, 0, 2, ["gridlock"])],
 )
 def test_what_fails_a_run(supervised, speeds, gridlocks, failed):
-    tally = Tally()
+    tally = Tally.empty()
     for _ in range(speeds):
         list(tally.once(3.0, "line_speed_mps", "A", 41.0, 40.0, edge="e"))
     told = tally.outcome(supervised, {"gridlocks": gridlocks})
@@ -98,7 +97,7 @@ def test_what_fails_a_run(supervised, speeds, gridlocks, failed):
 
 
 def test_a_pair_is_told_once_whoever_counts_it():
-    tally = Tally()
+    tally = Tally.empty()
 
     def ours(time, who, value):
         return list(tally.once(time, "gap_m", who, value, 0.0, trains=who.split("-")))
@@ -114,6 +113,3 @@ def test_a_pair_is_told_once_whoever_counts_it():
     told = tally.outcome(False, {})
     assert (told["collisions"], told["checks_failed"], told["first_violation"]["who"]) == (2, ["collision"], "C-A")
     assert told["worst"]["gap_m"] == {"time_s": 10.0, "who": "B-A", "value": -7.0, "limit": 0.0}
-    again = Tally()
-    again.restore(tally.values())
-    assert again.outcome(False, {}) == told

@@ -7,6 +7,15 @@ from typing import NamedTuple
 REPRODUCED = "reproduced"
 WITH_CORRECTION = "with correction"
 NOT = "not reproducible"
+BEYOND = "beyond the paper"
+
+#: Verdict -> what it says, in the order of a count.
+VERDICTS = {
+    REPRODUCED: "comes out as stated, from what the paper prints; where it prints nothing, the note names what was chosen",
+    WITH_CORRECTION: "comes out once a print error is corrected, or a statement read more narrowly, as the note says",
+    NOT: "does not come out; the note names every reading and value that was tried",
+    BEYOND: "judges an assumption of ours, such as force limits, that the paper does not make: no verdict on the paper",
+}
 
 
 class Claim(NamedTuple):
@@ -22,10 +31,20 @@ class Claim(NamedTuple):
 
 
 def claim(
-    text: str, stated: float | str, measured: float | str, unit: str, holds: bool, note: str = "", corrected: bool = False
+    text: str,
+    stated: float | str,
+    measured: float | str,
+    unit: str,
+    holds: bool,
+    note: str = "",
+    corrected: bool = False,
+    beyond: bool = False,
 ) -> Claim:
-    """A claim with its verdict: it holds as printed, holds with the correction that ``note`` names, or does not."""
-    verdict = NOT if not holds else WITH_CORRECTION if corrected else REPRODUCED
+    """A claim with its verdict: it holds as printed, holds with the correction that ``note`` names, or does not.
+
+    With ``beyond`` what is measured rests on an assumption of ours, and nothing is said of the paper.
+    """
+    verdict = BEYOND if beyond else NOT if not holds else WITH_CORRECTION if corrected else REPRODUCED
     return Claim("", text, stated, measured, unit, verdict, note)
 
 

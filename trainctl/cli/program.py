@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from trainctl.cli import diff, extend, golden, net, report, resume, sweep
+from trainctl.cli import cite, diff, extend, golden, net, report, resume, sweep
 from trainctl.cli.console import (
     DEFAULT_SCENARIO,
     Json,
@@ -247,6 +247,7 @@ def _options(
     """Closed-loop testbed for cooperative train control on SUMO rail networks."""
 
 
+cite.register(app)
 diff.register(app)
 extend.register(app)
 golden.register(app)

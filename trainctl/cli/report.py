@@ -197,25 +197,28 @@ def claims(
     ] = False,
 ) -> None:
     """Measure every claim of the papers: what they state, what comes out here, the verdict and the correction."""
+    import os
     import sys
 
-    from trainctl.claims import NOT, PAPERS, REPRODUCED, WITH_CORRECTION, as_markdown, measure
+    from trainctl.citation import PAPERS
+    from trainctl.claims import BEYOND, NOT, REPRODUCED, VERDICTS, WITH_CORRECTION, as_markdown, counts, measure
     from trainctl.cli.console import Progress, listing, show, show_json
 
     if paper is not None and paper not in PAPERS:
         raise InputError(f"--paper {paper}: not known; there are: {', '.join(PAPERS)}")
     with Progress("claims", sys.stderr.isatty()) as advance:
-        found = measure([paper] if paper else list(PAPERS), advance)
+        found = measure([paper] if paper else list(PAPERS), advance, os.cpu_count() or 1)
     if as_json:
         show_json([claim._asdict() for claim in found])
     elif markdown:
         print(as_markdown(found))
     else:
+        from rich.markup import escape
         from rich.text import Text
 
-        colours = {REPRODUCED: "green", WITH_CORRECTION: "yellow", NOT: "red"}
+        colours = {REPRODUCED: "green", WITH_CORRECTION: "yellow", NOT: "red", BEYOND: "blue"}
         for name in dict.fromkeys(claim.paper for claim in found):
-            table = listing(f"{name}: {PAPERS[name]}")
+            table = listing(f"{name}: {escape(PAPERS[name].text())}")
             for column, share in (("claim", 5), ("paper", 2), ("measured", 2), ("unit", None), ("verdict", None), ("note", 5)):
                 table.add_column(column, ratio=share, overflow="fold")
             for claim in found:
@@ -224,5 +227,6 @@ def claims(
                     cells[4].stylize(colours[claim.verdict])
                     table.add_row(*cells)
             show(table)
-        counts = [f"{sum(c.verdict == verdict for c in found)} {verdict}" for verdict in (REPRODUCED, WITH_CORRECTION, NOT)]
-        print(f"{len(found)} claims: {', '.join(counts)}")
+        for verdict, words in VERDICTS.items():
+            print(f"{verdict}: {words}")
+        print(f"{len(found)} claims: {counts(found)}")

@@ -93,7 +93,7 @@ class Alarms:
         """
         if self.watched:
             s.now[:] = np.stack(self.p.law.watched_bounds(self.p.params, scene))
-            if not self.p.placed:
+            if self.p.driven:  # a train in no formation is watched by nobody
                 alone = np.bincount(scene.links.receiver, minlength=len(formation)) == 0
                 s.now[0, alone], s.now[1, alone] = -np.inf, np.inf
         piece = np.empty(len(formation), np.int64)
@@ -174,12 +174,12 @@ class Alarms:
         p, found, since = self.p, list[Wait](), dict[int, float]()
         if around.view is None or around.held is None:
             return
-        rules, assumed = (p.supervision, p.assumed) if p.placed else (p.driver_rules, p.relied_on_by_driver)
+        rules, assumed = (p.driver_rules, p.relied_on_by_driver) if p.driven else (p.supervision, p.assumed)
         if rules.mode == "on":  # otherwise nothing keeps a train from going on
             found = waiting.waits(
                 around.view, around.held, here, speed, rules, assumed, p.scenario.run.step_s, p.step_theta, traffic.standing
             )
-        if not p.placed:  # those whom nothing keeps that is known: their driver would start them
+        if p.driven:  # those whom nothing keeps that is known: their driver would start them
             known = {w.train for w in found}
             stand = np.flatnonzero(waiting.standing(here, speed, traffic.standing)).tolist()
             found += [Wait(i, -1, int(here.edge[i]), None) for i in stand if i not in known]

@@ -137,16 +137,16 @@ def with_targets(targets: Targets, train: Ints, room: Floats, kind: int) -> Targ
 
 def judge(
     params: Params, speed: Floats, targets: Targets, clear: Targets, limits: Limits, step: float, theta: float, assumed: Assumed,
-    acceleration: Floats,
+    acceleration: Floats, swing: Floats | None = None,
 ) -> Verdict:  # fmt: skip
     """What every train may do: following the one that joins ahead, or keeping the join clear, whichever leaves more.
 
     ``target`` of the verdict counts rows of ``clear`` on from those of ``targets``. Arguments as in ``supervisor.verdict``.
     """
-    follows = verdict(params, speed, targets, limits, step, theta, assumed, acceleration)
+    follows = verdict(params, speed, targets, limits, step, theta, assumed, acceleration, swing)
     if targets is clear:
         return follows
-    waits = verdict(params, speed, clear, limits, step, theta, assumed, acceleration)
+    waits = verdict(params, speed, clear, limits, step, theta, assumed, acceleration, swing)
     other = waits.greatest > follows.greatest
     waits = waits._replace(target=waits.target + np.where((waits.reason >= 0) & (waits.reason != LIMIT), len(targets.train), 0))
     return Verdict(
@@ -161,6 +161,8 @@ def judge(
 
 def measured(targets: Targets, limits: Limits, error: Floats) -> tuple[Targets, Limits]:
     """What trains are told whose positions are measured with an ``error`` (n,), measured minus true position [m]."""
+    if not error.any():
+        return targets, limits
     other = np.where(targets.other >= 0, error[targets.other], 0.0)
     ways = np.where(targets.kind == OPPOSING, -other, other)  # the front of one that comes: an error of its own way
     room = targets.room + ways - error[targets.train]

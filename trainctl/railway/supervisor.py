@@ -35,7 +35,8 @@ no margin touched: before a fixed point ``d >= D(v)``, behind a moving train ``d
 4. An actuator of lag r follows what is ordered late: ``a' = (u - a) / r``. Under full braking the speed ``v + r (a + braking)``
    falls just as that of a train without lag, and is never below v, so it takes the place of v before points; before speed limits
    ``v + r max(a, 0)`` does, the speed reached once no more is ordered. Where the slope changes by ds the force follows late too,
-   which gives the speed ``r g ds``; over a whole route that is at most ``surge``.
+   which gives the speed ``r g ds``; over a whole route that is at most ``surge``. Couplers that swing may speed up the head by
+   ``swing``, what their energy and that of the units against each other can give it.
 
 Holding the speed v behind a train of the same speed therefore needs v T beyond the margin: the train ahead may begin to brake
 now, its follower learns of it one step later.
@@ -216,7 +217,7 @@ def speed_after(room: Floats, target_speed: Floats, speed: Floats, b: float | Fl
 
 def verdict(
     params: Params, speed: Floats, targets: Targets, limits: Limits, step_s: float, theta: float,
-    assumed: Assumed | None = None, acceleration: Floats | None = None,
+    assumed: Assumed | None = None, acceleration: Floats | None = None, swing: Floats | None = None,
 ) -> Verdict:  # fmt: skip
     """Judge what every train may do over the coming step; the rule and its proof are in the notes of the module.
 
@@ -238,6 +239,8 @@ def verdict(
         What is relied on; trains that do as ordered if left out.
     acceleration : ndarray, shape (n,), optional
         Of every train now [m/s2]; needed where there is lag.
+    swing : ndarray, shape (n,), optional
+        By how much the couplers may still speed up its head [m/s]; counts before limits.
 
     Returns
     -------
@@ -250,7 +253,7 @@ def verdict(
     least = np.where(relied.lag > 0.0, -b, np.maximum(-b, -(speed + relied.drift) / step_s - relied.scatter))
     rates = np.concatenate([
         _before_targets(params, relied, speed, now, targets, step_s, theta),
-        _before_limits(params, relied, speed, now, limits, step_s, theta),
+        _before_limits(params, relied, speed, now, 0.0 if swing is None else swing, limits, step_s, theta),
     ])  # fmt: skip
     train = np.concatenate([targets.train, limits.train])
     bound = np.full(n, params.greatest_mps2)
@@ -278,13 +281,16 @@ def _braking(params: Params, relied: Assumed, speed: Floats, now: Floats, target
     more = relied.drift + relied.surge + relied.lag * np.maximum(now + relied.braking, 0.0)
     v, b = speed[i] + np.where(stop, relied.drift[i], more[i]), relied.braking[i]  # the room to a stop counts the lag already
     own = stopping_distance(v, b, step, theta)
-    known = j >= 0
-    margin = params.margin_m + relied.uncertainty[i] + np.where(known, relied.uncertainty[j], 0.0)
+    margin: Floats | float = params.margin_m
+    if relied.uncertainty.any():
+        margin = margin + relied.uncertainty[i] + np.where(j >= 0, relied.uncertainty[j], 0.0)
     room = np.minimum(targets.room, _FAR) - np.where(stop, 0.0, margin)
     follows = a_train & targets.moving & (params.curve == "relative")
     away = stopping_distance(np.maximum(targets.speed - relied.blur, 0.0), relied.hardest[j], step, theta)
-    comes = stopping_distance(targets.speed + np.where(known, more[j], 0.0), relied.braking[j], step, theta)
-    to_stop = np.where(follows, room + away, np.where(opposing & targets.moving, 0.5 * (room + own - comes), room))
+    to_stop = np.where(follows, room + away, room)
+    if (meets := opposing & targets.moving).any():
+        comes = stopping_distance(targets.speed + np.where(j >= 0, more[j], 0.0), relied.braking[j], step, theta)
+        to_stop = np.where(meets, 0.5 * (room + own - comes), to_stop)
     return _Braking(room, to_stop, v, own)
 
 
@@ -321,10 +327,10 @@ def _before_targets(
 
 
 def _before_limits(
-    params: Params, relied: Assumed, speed: Floats, now: Floats, limits: Limits, step: float, theta: float
+    params: Params, relied: Assumed, speed: Floats, now: Floats, swing: Floats | float, limits: Limits, step: float, theta: float
 ) -> Floats:
     """Greatest acceleration each limit leaves its train [m/s2], shape (k,)."""
-    settled = speed + relied.lag * np.maximum(now, 0.0) if relied.lag.any() else speed
+    settled = speed + swing + (relied.lag * np.maximum(now, 0.0) if relied.lag.any() else 0.0)
     train = limits.train
     v, top = settled[train], settled[train] + (params.greatest_mps2 + relied.scatter[train]) * step
     rate = np.full(len(v), np.inf)

@@ -161,6 +161,21 @@ class Prepared:
         return promise.planned(self.assumed, self.driver_rules.emergency_mps2)
 
     @property
+    def driven(self) -> bool:
+        """Whether a driver drives who is in no formation; else the law leads every train, or SUMO does."""
+        return not (self.placed or self.self_driven)
+
+    @property
+    def looks_ahead(self) -> bool:
+        """Whether anybody asks what is ahead of a train: its driver, or the supervisor."""
+        return self.driven or self.supervision.mode != "off"
+
+    @cached_property
+    def net_slope(self) -> Floats:
+        """Slope of every edge, rise / run, (E,); 0 on a line, whose gradient is known by the kilometrage."""
+        return np.zeros_like(self.rails.slope) if self.placed else self.rails.slope
+
+    @property
     def radio(self) -> Radio:
         """How messages travel."""
         run, top = self.scenario.run, self.scenario.topology

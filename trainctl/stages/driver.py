@@ -35,6 +35,21 @@ class Driven(NamedTuple):
     stands: Bools  # (n,) the train is held where it is
 
 
+def of(p: Prepared) -> Nobody | Driver:
+    """The driver of a scenario's trains."""
+    return Driver(p) if p.driven else Nobody()
+
+
+class Nobody:
+    """The law leads every train."""
+
+    def step(
+        self, speed: Floats, acceleration: Floats, around: Around, traffic: Traffic, formed: Formed, commanded: Floats
+    ) -> tuple[Driven, Formed]:
+        """No orders; see ``Driver.step``."""
+        return Driven(np.full(len(speed), np.nan), np.zeros(len(speed), bool)), formed
+
+
 class Driver:
     """Drives whoever no law does."""
 
@@ -68,8 +83,6 @@ class Driver:
         tuple of Driven and Formed
             The latter with the accelerations of its references.
         """
-        if self.p.placed:  # the law drives everybody
-            return Driven(np.full(self.n, np.nan), np.zeros(self.n, bool)), formed
         view, references, led = around.view, formed.references, formed.led
         assert view is not None
         front = convoys.fronts(formed.ahead)

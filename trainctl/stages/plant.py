@@ -105,6 +105,10 @@ class Points:
         """Nothing acts late here, so it does not matter."""
         return np.zeros(len(own))
 
+    def swing(self, own: Floats) -> Floats:
+        """A point has no couplers."""
+        return np.zeros(len(own))
+
     def overrun(self, own: Floats, braking: float) -> Floats:
         """Nothing acts late here."""
         return np.zeros(len(own))
@@ -145,9 +149,8 @@ class Units:
         )
         self.masses = p.consists.train_mass()
         self.lag = p.assumed.lag
-        guided = not p.placed
-        self.hilly = bool(len(self.gradient)) or (guided and bool(p.rails.slope.any()))
-        ordered = guided or p.supervision.mode != "off"
+        self.hilly = bool(len(self.gradient)) or bool(p.net_slope.any())
+        ordered = p.looks_ahead
         # Written anew in every step before they are read, like the columns of the plant's table that disturb it.
         self.told = shared.constants(p.plant_params, p.consists, self.gradient) if p.sampled else shared.NOBODY
         self.orders = integrate.Orders(
@@ -256,6 +259,7 @@ class Units:
         """
         heads = self.p.heads
         v, after = own[heads, SPEED], moved[heads, SPEED]
+        mean = np.where(after > 0.0, mean + (self.swing(moved) - self.swing(own)) / self.step_s, mean)
         if self.p.plant.STATES > FORCE:
             gained = self.lag * (np.maximum(self.acceleration(moved), 0.0) - np.maximum(self.acceleration(own), 0.0)) / self.step_s
             return np.where(after > 0.0, mean + gained, mean)
@@ -278,6 +282,18 @@ class Units:
         force = np.add.reduceat(own[:, FORCE], heads) - self.masses * self.believed_resistance(own)
         found: Floats = force / np.add.reduceat(c.mass * c.rotating, heads)
         return np.where(own[heads, SPEED] > 0.0, found, np.maximum(found, 0.0))
+
+    def swing(self, own: Floats) -> Floats:
+        """By how much couplers, and units against each other, may still speed up every head [m/s], (n,): all of their energy."""
+        c, v = self.p.consists, own[:, SPEED]
+        units = np.diff(c.first)
+        mean = np.add.reduceat(c.mass * v, c.first[:-1]) / self.masses
+        energy = c.mass * (v - np.repeat(mean, units)) ** 2
+        stretch = own[:-1, POSITION] - own[1:, POSITION] - c.length[:-1]
+        energy[:-1] += c.stiffness[:-1] * stretch**2  # 0 behind the last unit
+        fastest = mean + np.sqrt(np.add.reduceat(energy, c.first[:-1]) / np.minimum.reduceat(c.mass, c.first[:-1]))
+        more: Floats = np.maximum(fastest - v[self.p.heads], 0.0)
+        return more
 
     def overrun(self, own: Floats, braking: float) -> Floats:
         """How much farther every train comes to a stand than by ``braking`` [m/s2] from now on, as actuators act late [m], (n,).

@@ -28,7 +28,8 @@ class Protect:
         self.disturbing = disturbing
 
     def step(
-        self, t: float, view: View | None, own: Floats, acceleration: Floats, driven: Driven, stands: Bools, disturbed: Disturbed,
+        self, t: float, view: View | None, own: Floats, acceleration: Floats, swing: Floats, driven: Driven, stands: Bools,
+        disturbed: Disturbed,
         state: plant.State, acting: Bools, over_the_step: OverTheStep,
     ) -> tuple[plant.Moved, Bools]:  # fmt: skip
         """The plant over one step within what the supervisor allows, and the trains (n,) it acts on.
@@ -41,8 +42,8 @@ class Protect:
             What is ahead; None: nobody looks, nobody protects.
         own : ndarray, shape (U, s)
             State of all units.
-        acceleration : ndarray, shape (n,)
-            Of every train now [m/s2].
+        acceleration, swing : ndarray, shape (n,)
+            Of every train now [m/s2], and what its couplers may still give its head [m/s].
         driven : Driven
             What drivers order; NaN: as the law demands.
         stands : ndarray of bool, shape (n,)
@@ -58,8 +59,9 @@ class Protect:
         """
         if view is None or self.rules.mode == "off":
             return over_the_step(driven.ordered, disturbed, state, False), acting
-        verdict = self._verdict(view, own[self.p.heads, SPEED], acceleration, disturbed.measurement)
-        moved = over_the_step(driven.ordered, disturbed.calm(), plant.copied(state), True)
+        verdict = self._verdict(view, own[self.p.heads, SPEED], acceleration, swing, disturbed.measurement)
+        calm = disturbed.calm() if self.disturbing else disturbed
+        moved = over_the_step(driven.ordered, calm, plant.copied(state), True)
         within, acts = applied(verdict, moved.motion.asked)
         acts &= ~stands
         acts_on = self.rules.mode == "on" and bool(acts.any())
@@ -69,13 +71,14 @@ class Protect:
         self._tell(t, verdict, acts, acting, view, own[self.p.heads, SPEED])
         return moved, acts
 
-    def _verdict(self, view: View, speed: Floats, acceleration: Floats, error: Floats) -> supervisor.Verdict:
+    def _verdict(self, view: View, speed: Floats, acceleration: Floats, swing: Floats, error: Floats) -> supervisor.Verdict:
         """What every train may do over the coming step; ``error`` (n,) is that of the measured positions [m]."""
         targets, limits = authority.measured(view.targets, view.limits, error)
         clear = targets if view.clear is view.targets else authority.measured(view.clear, view.limits, error)[0]
         return authority.judge(
-            self.rules, speed, targets, clear, limits, self.p.scenario.run.step_s, self.p.step_theta, self.p.assumed, acceleration
-        )
+            self.rules, speed, targets, clear, limits, self.p.scenario.run.step_s, self.p.step_theta, self.p.assumed, acceleration,
+            swing,
+        )  # fmt: skip
 
     def _tell(self, t: float, verdict: supervisor.Verdict, acts: Bools, acting: Bools, view: View, speed: Floats) -> None:
         """Events where it begins or ends to act."""

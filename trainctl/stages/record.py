@@ -42,7 +42,7 @@ class Journal:
         self.watched = watched
         self.extras = p.plant.COLUMNS
         self.disturbances = DISTURBANCES if p.scenario.disturbance else ()
-        self.formed = not (p.placed or p.self_driven)
+        self.formed = p.driven
         tables = standard_tables(
             p.scenario.ids, p.line.track_ids, p.line.edges, units=self.has_units, watched=watched,
             train_extras=(

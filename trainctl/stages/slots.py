@@ -23,6 +23,8 @@ class State(NamedTuple):
 class Slots:
     """Trains on one track form; who changes track leaves one formation and joins another."""
 
+    CHECKS = True  # whether a law's start condition is asked again where links changed
+
     def __init__(self, p: Prepared, journal: Journal) -> None:
         self.p, self.journal = p, journal
         self.track_of = np.array([p.line.track_ids.index(t) for t in p.line.tracks], np.int64)

@@ -60,7 +60,7 @@ class Topology:
         ahead[behind] = links.order[rank[behind] - 1]
         formed = formed._replace(ahead=ahead, constants=p.law.constants(p.params, scene), made_of=(t, own.copy(), links))
         groups = graph.components(len(rank), links.sender, links.receiver)
-        check = before is not None and p.placed  # convoys have asked before they coupled
+        check = before is not None and self.rule.CHECKS
         self.journal.event(
             t,
             "topology",

@@ -75,9 +75,9 @@ class Traffic:
         self.step_s, self.theta = p.scenario.run.step_s, p.step_theta
         self.net, self.length = along.net(p.rails), p.consists.train_length()
         self.stops_of = np.array([len(stops) for stops in p.roster.stops], np.int64)
-        self.looks = p.supervision.mode != "off" or not p.placed
+        self.looks = p.looks_ahead
         planned = min(
-            p.supervision.emergency_mps2, p.supervision.service_mps2, *([] if p.placed else [p.driving.deceleration_mps2])
+            p.supervision.emergency_mps2, p.supervision.service_mps2, *([p.driving.deceleration_mps2] if p.driven else [])
         )
         self.claiming = np.minimum(p.assumed.braking, planned)  # what is claimed for, and braked with at least
         self.ways: Ways | None = None
@@ -86,9 +86,9 @@ class Traffic:
         """Before the run: trains that are placed have come."""
         n = len(self.length)
         return State(
-            came=np.full(n, self.p.placed), left=np.zeros(n, bool), next_stop=np.zeros(n, np.int64),
-            stands_until=np.full(n, np.nan), stopping=np.zeros(n, bool),
-            parked=np.zeros(n, bool), waits_for=np.full(n, -1), claims=interlocking.none(),
+            came=np.full(n, self.roster.placed), left=np.zeros(n, bool), next_stop=np.zeros(n, np.int64),
+            stands_until=np.full(n, np.nan), stopping=np.zeros(n, bool), parked=np.zeros(n, bool),
+            waits_for=np.full(n, -1), claims=interlocking.none(),
         )  # fmt: skip
 
     def step(
@@ -101,14 +101,14 @@ class Traffic:
         s = self.arrivals(t, seen, s)
         if not self.looks:
             return s, nothing(len(speed))
-        for i in np.flatnonzero(~s.came & self._given_up(t) & ~self._given_up(t - self.step_s)).tolist():
+        for i in [] if s.came.all() else np.flatnonzero(~s.came & self._given_up(t) & ~self._given_up(t - self.step_s)).tolist():
             self.journal.event(t, "given_up", train=self.p.scenario.ids[i], planned_s=float(self.roster.depart[i]))
         s, stops, soon = self._stops(t, seen, speed, overrun, s)
-        asking = [] if last else [*self._returning(t, s), *self.due(t, s)]
-        s, held, entries, kept_out = self.entering(t, ways, s.on_track(seen), speed, s, asking)
+        asking, reach = [] if last else [*self._returning(t, s), *self.due(t, s)], self._reach(speed)
+        s, held, entries, kept_out = self.entering(t, ways, s.on_track(seen), speed, s, asking, reach)
         present = s.on_track(seen).present.copy()
         present[[i for i, _ in entries]] = True
-        view = self._look(ways, seen._replace(present=present), speed, held, s)
+        view = self._look(ways, seen._replace(present=present), speed, held, s, self._reach(speed) if entries else reach)
         return s, Around(entries, stops, soon, held, kept_out, view)
 
     # Arrivals and entries
@@ -142,19 +142,19 @@ class Traffic:
         return [self.p.scenario.ids[i] for i in late]
 
     def entering(
-        self, t: float, ways: Ways, here: Seen, speed: Floats, s: State, due: Sequence[int]
+        self, t: float, ways: Ways, here: Seen, speed: Floats, s: State, due: Sequence[int], reach: Floats | None = None
     ) -> tuple[State, Held, tuple[tuple[int, float], ...], dict[int, int]]:
         """Trains of those that are ``due`` whose place is clear, with the speed they come with [m/s]; who keeps out the others."""
         asking = np.zeros(len(speed), bool)
         asking[due] = True
-        s, held = self._claim(t, ways, here, speed, asking, s)
+        s, held = self._claim(t, ways, here, self._reach(speed) if reach is None else reach, asking, s)
         s = s._replace(parked=s.parked.copy(), stands_until=s.stands_until.copy())
         present, came, come, kept_out = here.present.copy(), s.came.copy(), [], {}
         for i in due:
             if held.room[i] <= 0.0:
                 continue
             present[i] = True
-            view = self._look(ways, here._replace(present=present), speed, held, s)
+            view = self._look(ways, here._replace(present=present), speed, held, s, self._reach(speed))
             if s.parked[i]:
                 present[i] = self._may_return(i, speed, view)
                 if present[i]:  # and stands for one more step, the one in which it comes back
@@ -293,12 +293,12 @@ class Traffic:
         braking = supervisor.stopping_distance(v, self.claiming, self.step_s, self.theta)
         return braking + 4.0 * v * self.step_s + rules.margin_m + 2.0 * DRIVER_MARGIN_M + 50.0 + 6.0 * assumed.uncertainty
 
-    def _claim(self, t: float, ways: Ways, seen: Seen, speed: Floats, entering: Bools, s: State) -> tuple[State, Held]:
+    def _claim(self, t: float, ways: Ways, seen: Seen, reach: Floats, entering: Bools, s: State) -> tuple[State, Held]:
         """Let every train claim what lies within its reach; ``entering`` (n,) are those that ask to enter the net."""
         if self.ways is not ways:  # they changed
             self.ways, self.zones = ways, interlocking.zones(ways, self.net)
         claims, held, said = interlocking.claim(
-            self.zones, s.claims, seen.row, seen.position, self.length, seen.present, self._reach(speed),
+            self.zones, s.claims, seen.row, seen.position, self.length, seen.present, reach,
             self.p.supervision.margin_m + DRIVER_MARGIN_M, entering,
         )  # fmt: skip
         ids, edges = self.p.scenario.ids, self.p.rails.edges
@@ -312,10 +312,10 @@ class Traffic:
                 self.journal.event(t, "switch_granted", train=ids[one.train], edge=edges[one.zone])
         return s._replace(claims=claims, waits_for=held.by.copy()), held
 
-    def _look(self, ways: Ways, seen: Seen, speed: Floats, held: Held, s: State) -> View:
+    def _look(self, ways: Ways, seen: Seen, speed: Floats, held: Held, s: State, reach: Floats) -> View:
         """What is ahead of every train."""
-        horizon = float(np.max(self._reach(speed), where=seen.present, initial=0.0)) + 1000.0
-        if not self.p.placed:
+        horizon = float(np.max(reach, where=seen.present, initial=0.0)) + 1000.0
+        if self.p.driven:
             horizon = max(horizon, self.p.driving.join_range_m)
         return authority.look(
             ways, self.net, self.p.rails.speed_mps, self.roster.speed_factor, seen.row, seen.position, speed, self.length,

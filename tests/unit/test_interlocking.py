@@ -7,8 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from trainctl.railway import along, interlocking
-from trainctl.railway import bodies as in_the_way
+from trainctl.railway import along, bodies, interlocking
 from trainctl.railway.ways import ways as laid
 
 BRAKING = 0.8  # m/s2
@@ -226,10 +225,7 @@ def drive(net_of, routes, seed, n, limit=9000):
         reach = v**2 / (2 * BRAKING) + 3 * v + 2 * MARGIN
         state, held, _ = interlocking.claim(zones, state, row, s, length, present, reach, 2 * MARGIN)
         here = along.places(ways, net, row, s, length, present, 3000.0, interlocking.order(state))
-        room = np.minimum(along.obstacles(here, virtual=False).room, held.room) - MARGIN
-        state, held, _ = interlocking.claim(zones, state, row, s, length, present, reach, 2 * MARGIN)
-        here = along.places(ways, net, row, s, length, present, 3000.0, interlocking.order(state))
-        room = np.minimum(in_the_way.obstacles(here, virtual=False).room, held.room) - MARGIN
+        room = np.minimum(bodies.obstacles(here, virtual=False).room, held.room) - MARGIN
         wanted = np.minimum(v + acceleration, top)
         stops = -BRAKING + np.sqrt(BRAKING**2 + 2 * BRAKING * np.maximum(room, 0.0))  # v^2 / 2b + v <= room
         v = np.where(present, np.minimum(wanted, stops), 0.0)
@@ -245,9 +241,9 @@ def drive(net_of, routes, seed, n, limit=9000):
         for i in np.flatnonzero(present).tolist():
             for e, depth in occupied(ways, row, s, length, i):
                 on.setdefault(e, []).append((depth, depth - length[i], i))
-        for e, bodies in on.items():
-            bodies.sort()
-            assert all(a[0] < b[1] for a, b in pairwise(bodies)), ("overlap", seed, step, e, bodies)
+        for e, trains in on.items():
+            trains.sort()
+            assert all(a[0] < b[1] for a, b in pairwise(trains)), ("overlap", seed, step, e, trains)
             foes = [net_of.twin[e], *net_of.crossing[e]]
             assert not any(f in on for f in foes), ("foe", seed, step, e)
         turns |= {(int(e), a, b) for e, queue in state["joins"].items() for a, b in pairwise(queue)}

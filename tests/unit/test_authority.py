@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from trainctl.railway import authority as lookout
-from trainctl.railway import supervisor
-from trainctl.railway.supervisor import LIMIT, SWITCH, TRAIN, Limits, Params, Targets
+from trainctl.railway import authority, supervisor
+from trainctl.railway.supervisor import LIMIT, SWITCH, TRAIN, Limits, Params, Targets, as_ordered
 
 PARAMS = Params(mode="on")  # 1.0, 0.7, 20 m
 SPEED = np.array([30.0, 30.0, 30.0, 30.0])
@@ -16,7 +15,7 @@ def targets(*rows: tuple[int, float, float, bool, int]) -> Targets:
     """Of (train, room, speed, moving, kind)."""
     train, room, speed, moving, kind = zip(*rows, strict=True)
     return Targets(
-        np.array(train), np.array(room), np.array(speed), np.array(moving), np.array(kind), np.arange(len(rows)) + 10
+        np.array(train), np.array(room), np.array(speed), np.array(moving), np.array(kind), (np.array(train) + 1) % len(SPEED)
     )  # fmt: skip
 
 
@@ -28,7 +27,9 @@ SLOW = Limits(np.array([2]), np.array([0.0]), np.array([30.0]))
 
 
 def judged(one: Targets, other: Targets) -> supervisor.Verdict:
-    return lookout.judge(PARAMS, SPEED, one, other, SLOW, 1.0, 0.5)
+    return authority.judge(
+        PARAMS, SPEED, one, other, SLOW, 1.0, 0.5, as_ordered(PARAMS.emergency_mps2, len(SPEED)), np.zeros(len(SPEED))
+    )
 
 
 def test_the_better_of_following_and_of_keeping_the_join_clear_holds():
