@@ -16,6 +16,7 @@ from trainctl.signals import FORCE, POWERS, SPEED, Floats, Reference, Scene
 
 TRAINS, UNITS = 4, 3
 ROWS = TRAINS * UNITS
+FREE = np.zeros(ROWS, bool)  # no unit is held at standstill
 SPEED_MPS = 80.0
 LEADER = np.array([200_000.0, SPEED_MPS, 0.0, 0.0])
 SPACING = 3000.0 + 80.0 * UNITS
@@ -102,7 +103,7 @@ def evaluate(
         )
 
     for i in range(n):
-        observer.correction(i, seen, scene.own[rows(i)], estimate[rows(i)], now.correction[rows(i)])
+        observer.correction(i, seen, scene.own[rows(i)], estimate[rows(i)], FREE[rows(i)], now.correction[rows(i)])
         if law.ORDER == "parallel":
             say(i)
     for i in links.order.tolist():
@@ -114,8 +115,9 @@ def evaluate(
         )  # fmt: skip
         plant.limit(i, moves, scene.own[rows(i)], now.force[rows(i)])
         observer.rate(
-            i, seen, scene.own[rows(i)], estimate[rows(i)], now.correction[rows(i)], now.force[rows(i)], now.estimate_rate[rows(i)]
-        )
+            i, seen, scene.own[rows(i)], estimate[rows(i)], FREE[rows(i)], now.correction[rows(i)], now.force[rows(i)],
+            now.estimate_rate[rows(i)],
+        )  # fmt: skip
         plant.rate(i, moves, 0.0, 0.0, scene.own[rows(i)], now.force[rows(i)], now.own_rate[rows(i)], now.power[i])
         if law.ORDER == "chain":
             say(i)

@@ -43,7 +43,7 @@ def keep_by_sources() -> None:
     here = Path(__file__).parent
     digest = hashlib.sha256(numba.__version__.encode())
     compiled = [p for part in ("plants", "controllers", "observers", "topology", "railway") for p in (here / part).glob("*.py")]
-    for path in sorted([*(here / f"{name}.py" for name in ("signals", "davis", "kernels")), *compiled]):
+    for path in sorted([*(here / f"{name}.py" for name in ("signals", "davis", "draws", "kernels")), *compiled]):
         digest.update(path.read_bytes())
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     config.CACHE_DIR = str(base / "trainctl" / f"kernels-{digest.hexdigest()[:16]}")

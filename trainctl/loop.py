@@ -130,7 +130,7 @@ class Loop(Steps):
         moved, acts = self.protect.step(
             t, around.view, own, acceleration, self.plant.swing(own), driven, stands, acting, units, s.watch.acting, over_the_step
         )  # fmt: skip
-        self._check(t, moved)
+        self._check(t, own, demand, moved)
 
         # record, command and step
         watch = s.watch._replace(acting=acts)
@@ -233,17 +233,28 @@ class Loop(Steps):
         )  # fmt: skip
         return moved._replace(motion=kept)
 
-    def _check(self, t: float, moved: plant.Moved) -> None:
+    def _check(self, t: float, own: Floats, demand: Demand, moved: plant.Moved) -> None:
         """Numbers must stay finite; a train never moves backwards."""
         motion = moved.motion
         if not (np.isfinite(moved.own).all() and np.isfinite(motion.displacement).all()):
             finite = np.logical_and.reduceat(np.isfinite(moved.own).all(axis=1), self.p.heads)
-            wrong = np.flatnonzero(~(finite & np.isfinite(motion.displacement)))
+            wrong = np.flatnonzero(~(finite & np.isfinite(motion.displacement))).tolist()
             names = ", ".join(self.p.scenario.ids[i] for i in wrong)
-            raise LawError(f"the state of train {names} is no longer finite after {t:g} s: the law or the step diverged")
+            before = [line for i in wrong if (line := self._acted(i, own, demand, motion))]
+            why = "; ".join(before) or "nothing was held, limited or saturated, so the law or its step diverged by itself"
+            raise LawError(f"the state of train {names} is no longer finite after {t:g} s: {why}")
         astray = np.flatnonzero(~(np.abs(moved.state.estimate) < ASTRAY).all(axis=1))
         if len(astray):
             names = ", ".join(dict.fromkeys(self.p.scenario.ids[i] for i in np.searchsorted(self.p.heads, astray, "right") - 1))
             raise LawError(f"the estimates of train {names} passed {ASTRAY:g} after {t:g} s: its observer diverged")
         for i in np.flatnonzero(motion.clipped).tolist():
             self.journal.event(t, "limit", train=self.p.scenario.ids[i], what="backwards", note="held at standstill")
+
+    def _acted(self, i: int, own: Floats, demand: Demand, motion: Motion) -> str:
+        """What kept train ``i`` from doing what its law asks for, in words; empty if nothing did."""
+        first = self.p.consists.first
+        stood = [str(u + 1) for u in np.flatnonzero(own[first[i] : first[i + 1], SPEED] <= 0.0).tolist()]
+        said = [f"held at standstill (unit {', '.join(stood)})"] if stood else []
+        said += ["limited by its plant"] if motion.limited[i] else []
+        said += ["its law saturated"] if demand.saturated[i] else []
+        return f"train {self.p.scenario.ids[i]} was {', '.join(said)}" if said else ""

@@ -309,11 +309,16 @@ class Observer(Protocol):
     def initial(self, params: Any, own: Floats) -> Floats:
         """Estimates at the start, shape (U, width)."""
 
-    def correction(self, i: int, constants: Any, own: Floats, estimate: Floats, out: Floats) -> None:
-        """Write the corrections of train ``i``, which the law may read, into ``out`` (units, CORRECTIONS)."""
+    def correction(self, i: int, constants: Any, own: Floats, estimate: Floats, held: Bools, out: Floats) -> None:
+        """Write the corrections of train ``i``, which the law may read, into ``out`` (units, CORRECTIONS).
 
-    def rate(self, i: int, constants: Any, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats) -> None:
-        """Write d(estimate)/dt into ``out``; ``applied`` [N] is what the limits left of the demand."""
+        ``held`` (units,) are units the plant holds at standstill: they stay, whatever forces act on them.
+        """
+
+    def rate(
+        self, i: int, constants: Any, own: Floats, estimate: Floats, held: Bools, correction: Floats, applied: Floats, out: Floats
+    ) -> None:
+        """Write d(estimate)/dt into ``out``; ``applied`` [N] is what the limits left of the demand, ``held`` as above."""
 
     def fault_estimate(self, constants: Any, estimate: Floats) -> Floats:
         """What it takes the faults for [m/s3], (U,), for logs; NaN where it estimates none."""
@@ -374,9 +379,10 @@ class PointPlant(Plant, Protocol):
     """Trains as points, moved from step to step by an exact map: see ``plants.point`` for ``Kick`` and ``Moved``."""
 
     def constants(
-        self, params: Any, consists: Consists, resistance_factor: Floats | None = None, gradient: Floats | None = None
-    ) -> Any:
-        """Arrays of all trains; those of ``plants.point.Constants`` are among them."""
+        self, params: Any, consists: Consists, resistance_factor: Floats | None = None, gradient: Floats | None = None,
+        clamps: Bounds | None = None,
+    ) -> Any:  # fmt: skip
+        """Arrays of all trains; those of ``plants.point.Constants`` are among them, and what clamps each train."""
 
     def advance(self, constants: Any, own: Floats, acceleration: Floats, step: float, kick: Any) -> Any:
         """One step of all trains that are asked for ``acceleration`` (n,)."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from units import ROWS, TRAINS, arrays, at_rest, disturbed, modules, moved, others, rows
+from units import FREE, ROWS, TRAINS, arrays, at_rest, disturbed, modules, moved, others, rows
 
 from trainctl import observers
 from trainctl.signals import FORCE, SPEED, Floats, Scene
@@ -26,7 +26,7 @@ def observed(observer: Any, scene: Scene, estimate: Floats, applied: Floats) -> 
     constants = observer.constants(observer.Params(), scene)
     correction, rate = np.zeros((ROWS, observer.CORRECTIONS)), np.zeros_like(estimate)
     for i in range(TRAINS):
-        part = scene.own[rows(i)], estimate[rows(i)], correction[rows(i)]
+        part = scene.own[rows(i)], estimate[rows(i)], FREE[rows(i)], correction[rows(i)]
         observer.correction(i, constants, *part)
         observer.rate(i, constants, *part, applied[rows(i)], rate[rows(i)])
     return correction, rate
@@ -87,12 +87,12 @@ def test_exact_estimates_at_an_equilibrium_stay(observer: Any) -> None:
 def test_an_observer_that_breaks_the_contract_is_found_out() -> None:
     good = OBSERVERS["intermediate"]
 
-    def reads_all(i: int, constants: Any, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats) -> None:
-        good.rate(i, constants, own, estimate, correction, applied, out)
+    def reads_all(i: int, constants: Any, own: Any, estimate: Any, held: Any, correction: Any, applied: Any, out: Any) -> None:
+        good.rate(i, constants, own, estimate, held, correction, applied, out)
         out[0, 2] += 1e-9 * constants.train.units[:, 1].sum()
 
-    def writes(i: int, constants: Any, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats) -> None:
-        good.rate(i, constants, own, estimate, correction, applied, out)
+    def writes(i: int, constants: Any, own: Any, estimate: Any, held: Any, correction: Any, applied: Any, out: Any) -> None:
+        good.rate(i, constants, own, estimate, held, correction, applied, out)
         applied[0] += 1.0
 
     checks = (

@@ -135,8 +135,9 @@ CASES |= {
     "noise without seed": (
         ROBUST + '[[disturbance]]\non = "position"\nshape = "gaussian"\nstd_m = 0.1\n', ["random, so it needs a seed, [run] seed"],
     ),
-    "clamps beside the bounds": (
-        ROBUST + "[bounds]\nspeed_upper_mps = 84.0\n", ["plant.speed_upper_mps = 85.0: must be [bounds] speed_upper_mps = 84.0"],
+    "tables against the order of positions": (
+        ROBUST + "[[train]]\nid = 3\nposition_m = 22000.0\n",
+        ["train[3].position_m = 22000: ahead of train 2 at 18500 m, whose table comes before", "track 1 must go front to rear"],
     ),
     "outside (39)": (
         FAULTY + "[[train]]\nid = 3\nposition_m = 4000.0\n", ["distance error -4948 m is not between -2351 and 1947 m", "condition (39)"],

@@ -62,13 +62,14 @@ class Evaluated:
         for i in s.links.order:
             rows, hears = slice(FIRST[i], FIRST[i + 1]), slice(s.links.first[i], s.links.first[i + 1])
             own, est = np.ascontiguousarray(s.own[rows]), np.ascontiguousarray(estimate[rows])
-            asymptotic.correction(i, observer, own, est, self.correction[rows])
+            free = np.zeros(len(own), bool)
+            asymptotic.correction(i, observer, own, est, free, self.correction[rows])
             brought = np.ascontiguousarray(self.sent[s.links.sender[hears]]) if heard is None else heard[hears]
             law.demand(
                 i, self.constants, leader, age, s.links.slot[i], own, est, self.correction[rows], s.links.desired[hears], brought,
                 self.out[rows],
             )  # fmt: skip
-            asymptotic.rate(i, observer, own, est, self.correction[rows], self.out[rows], self.estimate_rate[rows])
+            asymptotic.rate(i, observer, own, est, free, self.correction[rows], self.out[rows], self.estimate_rate[rows])
             law.message(i, self.constants, leader, s.links.slot[i], own, est, self.estimate_rate[rows], self.sent[i])
 
 

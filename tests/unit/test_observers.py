@@ -41,10 +41,13 @@ def plant_rate(constants, own, applied, t=0.0):
     return out
 
 
-def observed(observer, constants, own, estimate, applied):
+FREE = np.zeros(3, bool)
+
+
+def observed(observer, constants, own, estimate, applied, held=FREE):
     correction, out = np.zeros((len(own), observer.CORRECTIONS)), np.zeros_like(estimate)
-    observer.correction(0, constants, own, estimate, correction)
-    observer.rate(0, constants, own, estimate, correction, applied, out)
+    observer.correction(0, constants, own, estimate, held, correction)
+    observer.rate(0, constants, own, estimate, held, correction, applied, out)
     return correction, out
 
 
@@ -151,7 +154,7 @@ def test_error_obeys_the_matrix_exponential():
     xi, ex = errors(1.0, own, estimate)
     np.testing.assert_allclose(ex, ex0 * math.exp(-3.0), rtol=1e-8)
     for u in range(3):
-        A = error_matrix(constants.k2, constants.k3, constants.k4[u], constants.C[u], [1.0])
+        A = error_matrix(constants.k2[u], constants.k3[u], constants.k4[u], constants.C[u], [1.0])
         expected = expm(A) @ xi0[u]
         np.testing.assert_allclose(xi[u], expected, atol=1e-7 * np.abs(xi0[u]).max())
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from trainctl import draws
 from trainctl.topology import graph
 from trainctl.topology.exchange import Radio, deliver, relinked, silent
 
@@ -13,7 +14,7 @@ NOTHING = graph.Stated(None, None, None, None)
 def plan(**more):
     fields = {
         "rule": "same_track", "equal": False, "first_slot": 0.0, "desired": np.full(5, 5000.0), "lower": np.full(5, 100.0),
-        "upper": np.full(5, 10000.0), "weight": 1.0, "stated": {}, "extra": (), "fixed": (),
+        "upper": np.full(5, 10000.0), "weight": 1.0, "stated": {}, "extra": (), "fixed": (), "place": np.arange(6),
     }  # fmt: skip
     return graph.Plan(**{**fields, **more})
 
@@ -90,6 +91,9 @@ def test_senders_ahead_come_first_in_order():
             assert rank[sender] < rank[receiver]
 
 
+NAMES = np.array([draws.word(str(i)) for i in range(1, 7)])
+
+
 def deliveries(radio, links, count):
     """Which links heard in so many exchanges, and the messages after them; train i says k in exchange k."""
     messages, heard, position = silent(), [], np.arange(6.0) * -1000.0
@@ -101,14 +105,25 @@ def deliveries(radio, links, count):
 
 def test_losses_are_seeded_and_of_the_stated_share():
     links = made(plan(), [1] * 6)
-    first, again, other = (deliveries(Radio(0.1, 0, np.inf, seed), links, 2000)[0] for seed in (1, 1, 2))
+    first, again, other = (deliveries(Radio(0.1, 0, np.inf, seed, NAMES), links, 2000)[0] for seed in (1, 1, 2))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
     assert 1 - first.mean() == pytest.approx(0.1, abs=0.01)
 
 
+def test_losses_belong_to_sender_and_receiver():
+    """Trains that come between, or stand in another order, change nobody else's losses; links lose independently."""
+    few, many = made(plan(), [1] * 6), made(plan(), [1] * 6)
+    turned = NAMES[::-1].copy()
+    one, other = (deliveries(Radio(0.3, 0, np.inf, 5, names), links, 2000)[0] for names, links in ((NAMES, few), (turned, many)))
+    pair = {(NAMES[s], NAMES[r]): one[:, k] for k, (s, r) in enumerate(zip(few.sender, few.receiver, strict=True))}
+    for k, (s, r) in enumerate(zip(many.sender, many.receiver, strict=True)):
+        assert np.array_equal(other[:, k], pair[turned[s], turned[r]])
+    assert np.abs(np.corrcoef(one.T) - np.eye(one.shape[1])).max() < 0.1
+
+
 def test_a_lost_message_leaves_the_last_one_in_place():
-    links, radio = made(plan(), [1] * 6), Radio(0.5, 0, np.inf, 3)
+    links, radio = made(plan(), [1] * 6), Radio(0.5, 0, np.inf, 3, NAMES)
     messages = silent()
     for k in range(50):
         before = messages
@@ -120,7 +135,7 @@ def test_a_lost_message_leaves_the_last_one_in_place():
 
 def test_an_exchange_leaves_the_messages_before_as_they_were():
     """Whoever tries a step must find them again."""
-    links, radio = made(plan(), [1] * 6), Radio(0.5, 1, np.inf, 3)
+    links, radio = made(plan(), [1] * 6), Radio(0.5, 1, np.inf, 3, NAMES)
     messages = deliveries(radio, links, 5)[1]
     sent, heard, ever = [s.copy() for s in messages.sent], messages.heard.copy(), messages.ever.copy()
     later, _ = deliver(radio, messages, np.full((6, 1), 9.0), np.zeros(6), links, 5)
@@ -131,24 +146,24 @@ def test_an_exchange_leaves_the_messages_before_as_they_were():
 
 def test_delay_counts_exchanges():
     links = made(plan(), [1] * 6)
-    heard, messages = deliveries(Radio(0.0, 2, np.inf, 0), links, 3)
+    heard, messages = deliveries(Radio(0.0, 2, np.inf, 0, NAMES), links, 3)
     assert heard.all(axis=1).tolist() == [False, False, True]
     assert np.all(messages.heard == 0.0)
-    heard, messages = deliveries(Radio(0.0, 2, np.inf, 0), links, 8)
+    heard, messages = deliveries(Radio(0.0, 2, np.inf, 0, NAMES), links, 8)
     assert np.all(messages.heard == 5.0) and len(messages.sent) == 3  # what has arrived is not kept
 
 
 def test_messages_end_at_the_range():
     links = made(plan(), [1] * 6)
     position = np.array([0.0, -1000.0, -3000.0, -4000.0, -5000.0, -6000.0])
-    _, heard = deliver(Radio(0.0, 0, 1500.0, 0), silent(), np.zeros((6, 1)), position, links, 0)
+    _, heard = deliver(Radio(0.0, 0, 1500.0, 0, NAMES), silent(), np.zeros((6, 1)), position, links, 0)
     pairs = {frozenset((int(s), int(r))) for s, r, h in zip(links.sender, links.receiver, heard, strict=True) if not h}
     assert pairs == {frozenset((1, 2))}
 
 
 def test_what_was_heard_stays_with_its_link_when_the_graph_changes():
     before, after = made(plan(), [1, 1, 1, 1, 2, 1]), made(plan(), [1, 3, 1, 1, 1, 1])
-    messages, _ = deliver(Radio(0.0, 0, np.inf, 0), silent(), np.arange(6.0)[:, None], np.zeros(6), before, 0)
+    messages, _ = deliver(Radio(0.0, 0, np.inf, 0, NAMES), silent(), np.arange(6.0)[:, None], np.zeros(6), before, 0)
     messages = relinked(messages, before, after)
     heard = {
         (int(s), int(r)): (v, e)
@@ -161,7 +176,7 @@ def test_what_was_heard_stays_with_its_link_when_the_graph_changes():
 def test_a_link_that_has_received_once_stays_one_whatever_is_lost_and_however_the_graph_changes():
     """A train that goes by old messages must not take the zeros of a new link for one."""
     before, after = made(plan(), [1, 1, 1, 1, 2, 1]), made(plan(), [1, 3, 1, 1, 1, 1])
-    messages, radio = silent(), Radio(0.5, 0, np.inf, 3)
+    messages, radio = silent(), Radio(0.5, 0, np.inf, 1, NAMES)
     received, last = np.zeros(len(before.sender), bool), np.zeros(len(before.sender))
     for k in range(1, 3):
         messages, heard = deliver(radio, messages, 10.0 * k + np.arange(6.0)[:, None], np.zeros(6), before, k)

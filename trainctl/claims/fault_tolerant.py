@@ -126,7 +126,7 @@ class Example:
         for k in range(round(duration / chunk)):
             t = k * chunk
             if self.seed is not None:
-                moving.units[:, plant.NOISE] = plant.noise(NOISY, self.seed, round(t / NOISY.noise_hold_s), 9)
+                plant.make_noise(NOISY, moving, self.seed, round(t / NOISY.noise_hold_s))
             if self.period and k % round(self.period / chunk) == 0:  # nothing has been heard yet at the start: the exact chain
                 integrate.exchange(
                     parts, loop, c.first, s.links, references, air._replace(live=k == 0), t, own, estimate, work
@@ -308,7 +308,7 @@ def numbers(runs: Runs) -> Iterator[Claim]:
     gains = asymptotic.constants(asymptotic.Params(), paper_scene())
     k4, C = gains.k4[0], gains.C[0]
     matrix = np.zeros((5, 5))
-    matrix[0, :2], matrix[1, 0], matrix[1, 2:], matrix[2:, 0] = [gains.k2, 1.0], gains.k3, C, k4
+    matrix[0, :2], matrix[1, 0], matrix[1, 2:], matrix[2:, 0] = [gains.k2[0], 1.0], gains.k3[0], C, k4
     matrix[3, 4], matrix[4, 3] = 1.0, -1.0
     apart = float(np.abs(np.poly(matrix) / np.poly(np.full(5, -3.0)) - 1.0).max())
     yield claim("all eigenvalues of the observer's D_ij are placed at -3: characteristic polynomial against (s + 3)^5", 0, apart, "1",

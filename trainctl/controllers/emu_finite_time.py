@@ -23,6 +23,8 @@ Corrections to the print: (8) counts the full length of the trains ahead and of 
 is the clear distance; the compression branch of w holds for both units of a pair, as Lemma 1 needs, and so does the branch b = 0;
 weights are taken at most 1 mm inside the coupler's range and 1 m short of the emergency distance, where the print leaves them
 undefined. Every head is pinned, as printed. ls belongs to each pair of trains: longer where a train left and its slot is kept.
+Masses that differ within a train (``weighted_by_mass``): a coupler pulls both its units with one force, of the mass that keeps
+their relative motion that of equal units, heads and tails pull as the mean unit does; V of (15) by mass falls.
 """
 
 from __future__ import annotations
@@ -61,7 +63,7 @@ HEAD, HEAD_SPEED, TAIL, TAIL_SPEED, LENGTH_OF_TRAIN = range(5)
 MESSAGE = 5
 
 #: Columns of ``Constants.units``.
-MASS, INERTIA, C0, C1, C2, LENGTH, K_HAT = range(7)
+MASS, INERTIA, C0, C1, C2, LENGTH, K_HAT, PAIR, MEAN = range(9)
 
 #: How near to the ends of their ranges the weights are evaluated [m].
 COUPLER_MARGIN, INTERVAL_MARGIN = 1e-3, 1.0
@@ -89,6 +91,9 @@ class Params(Table):
     p_4: float = Field(1.0, gt=0.0, description="Gain on speeds between trains, eq. (13) [(m/s)^(1-alpha_2)/s]")
     mu_1: float = Field(0.05, gt=0.0, description="Gain of a head on its position error, eq. (13) [m^(1-alpha_1)/s2]")
     mu_2: float = Field(0.1, gt=0.0, description="Gain of a head on its speed error, eq. (13) [(m/s)^(1-alpha_2)/s]")
+    weighted_by_mass: bool = Field(
+        False, description="Units of one train may differ in mass: couplers pull both alike, beyond the paper"
+    )
     coupler_stretch_m: float = Field(0.1, gt=COUPLER_MARGIN, description="h1, largest stretch of a coupler [m], eq. (11)")
     coupler_compression_m: float = Field(0.1, gt=COUPLER_MARGIN, description="h2, largest compression of a coupler [m], eq. (11)")
     stretch_zone_m: float = Field(0.05, gt=0.0, description="delta1, width of the barrier before h1 [m]")
@@ -103,7 +108,7 @@ class Constants(NamedTuple):
     """Units, gains and zones."""
 
     first: Ints  # (n + 1,)
-    units: Floats  # (U, 7) one column per constant named above
+    units: Floats  # (U, 9) one column per constant named above
     alpha1: float
     alpha2: float
     p1: float
@@ -129,13 +134,21 @@ def constants(params: Params, scene: Scene) -> Constants:
     most = int((np.diff(c.first) + np.diff(scene.links.first)).max(initial=0))
     terms = np.zeros((4, -(-most // BLOCK) * BLOCK))
     inertia = c.mass * c.rotating
-    units = np.column_stack([c.mass, inertia, c.davis, c.length, c.stiffness / inertia])
+    pair = pair_inertia(inertia)
+    mean = np.repeat(np.add.reduceat(inertia, c.first[:-1]) / np.diff(c.first), np.diff(c.first))
+    units = np.column_stack([c.mass, inertia, c.davis, c.length, c.stiffness / pair, pair, mean])
     p = params
     return Constants(
         c.first, np.ascontiguousarray(units, dtype=np.float64), p.alpha_1, 2.0 * p.alpha_1 / (1.0 + p.alpha_1), p.p_1, p.p_2, p.p_3,
         p.p_4, p.mu_1, p.mu_2, p.coupler_stretch_m, p.coupler_compression_m, p.stretch_zone_m, p.compression_zone_m,
         p.emergency_distance_m, p.emergency_zone_m, p.range_m, p.range_zone_m, terms,
     )  # fmt: skip
+
+
+def pair_inertia(inertia: Floats) -> Floats:
+    """Of every unit and the next one [kg], (U,): twice the reduced mass, the mass of either where they are equal."""
+    after = np.append(inertia[1:], inertia[-1])
+    return np.where(after == inertia, inertia, 2.0 * inertia * after / (inertia + after))
 
 
 @inlined()
@@ -227,7 +240,7 @@ def demand(
     for j in range(last):
         row = start + j
         weight = coupler_weight(e[j], c.h1, c.h2, c.delta1, c.delta2) - k_p1 * units[row, K_HAT]
-        pull = units[row, INERTIA] * weight * (c.p1 * e_power[j] + c.p3 * dv_power[j])
+        pull = units[row, PAIR] * weight * (c.p1 * e_power[j] + c.p3 * dv_power[j])
         out[j] -= pull
         out[j + 1] += pull
     a_head = -(c.mu1 * e_power[last] + c.mu2 * dv_power[last])
@@ -240,8 +253,8 @@ def demand(
         else:
             ls = -desired[k] - ahead - units[start + last, LENGTH]
             a_tail -= train_weight(e[z], ls, c.le, c.beta, c.gamma1, c.gamma2) * (c.p2 * e_power[z] + c.p4 * dv_power[z])
-    out[0] += units[start, INERTIA] * a_head
-    out[last] += units[start + last, INERTIA] * a_tail
+    out[0] += units[start, MEAN] * a_head
+    out[last] += units[start, MEAN] * a_tail
 
 
 @inlined()
@@ -303,12 +316,13 @@ def broken_trains(params: Params, scene: Scene) -> list[str]:
     c, (h1, h2) = scene.consists, (params.coupler_stretch_m, params.coupler_compression_m)
     inertia = c.mass * c.rotating
     for i, (name, a, b) in enumerate(zip(scene.trains, c.first[:-1], c.first[1:], strict=True)):
-        if np.ptp(inertia[a:b]) > 1e-9 * inertia[a]:
+        if np.ptp(inertia[a:b]) > 1e-9 * inertia[a] and not params.weighted_by_mass:
             found.append(
                 f"train {name}: unit_mass_kg times rotating_mass_factor = {inertia[a:b].min():g} to {inertia[a:b].max():g}: "
-                "the units of one train must be equally heavy, or neighbours do not pull each other alike (Lemma 1)"
+                "the units of one train must be equally heavy, or neighbours do not pull each other alike (Lemma 1); "
+                "controller.weighted_by_mass = true repairs that"
             )
-        k_hat = c.stiffness[a:b] / inertia[a:b]
+        k_hat = c.stiffness[a:b] / pair_inertia(inertia)[a:b]
         if k_hat.max() >= params.p_1:
             found.append(
                 f"controller.p_1 = {params.p_1:g}: must exceed coupler stiffness over mass, {k_hat.max():g} 1/s2 in train {name}, "
@@ -410,9 +424,10 @@ def largest_sub_step(params: Params, scene: Scene) -> float:
             w[a:b] = 1.0
             fastest = max(fastest, RUNGE_KUTTA_LIMIT / BOUNDED_STEP)
         k_p1 = c.units[a : b - 1, K_HAT] / c.p1
-        edges = np.diff(np.eye(b - a), axis=0)
+        inertia = c.units[a:b, INERTIA]
+        edges, heavy = np.diff(np.eye(b - a), axis=0) * np.sqrt(inertia[0] / inertia), c.units[a : b - 1, PAIR] / inertia[0]
         for weights, chatter in ((w[a : b - 1], CHATTER_AT_BARRIER), (np.ones(b - a - 1), CHATTER_SETTLED)):
-            stiffest = np.linalg.eigvalsh(edges.T @ np.diag(weights - k_p1) @ edges)[-1]
+            stiffest = np.linalg.eigvalsh(edges.T @ np.diag(heavy * (weights - k_p1)) @ edges)[-1]
             fastest = max(fastest, float(c.p3 * stiffest * c.alpha2 * chatter ** (c.alpha2 - 1.0)))
     return RUNGE_KUTTA_LIMIT / fastest if fastest > 0.0 else math.inf
 
@@ -463,7 +478,7 @@ def rehearse(
                     if u + 1 < b:
                         stretch = own[u, POSITION] - own[u + 1, POSITION] - units[u, LENGTH]
                         w[u] = coupler_weight(stretch, c.h1, c.h2, c.delta1, c.delta2)
-                    spring = units[u, K_HAT] * units[u, INERTIA] * stretch
+                    spring = units[u, K_HAT] * units[u, PAIR] * stretch
                     rate[u, POSITION] = v
                     rate[u, SPEED] = (given - drag + pull - spring) / units[u, INERTIA]
                     pull = spring

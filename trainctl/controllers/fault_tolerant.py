@@ -40,11 +40,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
+from trainctl.carriages import miscounted, miscounted_trains, of_trains, spread
 from trainctl.controllers import stated
 from trainctl.kernels import inlined
 from trainctl.signals import POSITION, SPEED, ContinuousLaw, Floats, Ints, Links, Scene, Table, leader_at
@@ -82,20 +83,30 @@ X_RATE, V_RATE, W_DRIFT, UNCOMPENSATED, STATIC = 0, 1, 2, 3, 4
 #: communication period, and at 1 s the loop is lost; dropped at once it costs higher peaks of force.
 FADE = 0.2
 
+#: Keys that may be lists: one number per carriage, per train.
+CARRIAGE, HEAD = ("carriage_l1", "carriage_l2", "carriage_l3"), ("head_l1_per_s", "head_l2", "head_l3", "head_l4")
+
 #: Classic Runge-Kutta is stable to 2.78; the rest is margin.
 STABLE = 2.5
 
 
-class Params(Table):
-    """Keys of ``[controller]`` with ``law = "fault_tolerant"``. Bounds of distance are those of the links."""
+Gain = Annotated[float, Field(gt=0)]
+Gains = Gain | tuple[Gain, ...]
 
-    carriage_l1: float = Field(0.1, gt=0, description="l1, carriages behind the head, eq. (29)")
-    carriage_l2: float = Field(0.1, gt=0, description="l2, eq. (30)")
-    carriage_l3: float = Field(0.1, gt=0, description="l3, eq. (31)")
-    head_l1_per_s: float = Field(0.01, gt=0, description="ell1 of the heads [1/s]: distances settle with this rate, R3'")
-    head_l2: float = Field(2.1, gt=0, description="ell2, eq. (36); above 2")
-    head_l3: float = Field(4.3, gt=0, description="ell3, eq. (36); above 2 + ell2^2 / 2")
-    head_l4: float = Field(1.0, gt=0, description="ell4, eq. (37); above 1/2")
+
+class Params(Table):
+    """Keys of ``[controller]`` with ``law = "fault_tolerant"``. Bounds of distance are those of the links.
+
+    Gains are one number, or lists: of carriages with one per carriage of a train or of all trains, of heads with one per train.
+    """
+
+    carriage_l1: Gains = Field(0.1, description="l1, carriages behind the head, eq. (29)")
+    carriage_l2: Gains = Field(0.1, description="l2, eq. (30)")
+    carriage_l3: Gains = Field(0.1, description="l3, eq. (31)")
+    head_l1_per_s: Gains = Field(0.01, description="ell1 of the heads [1/s]: distances settle with this rate, R3'")
+    head_l2: Gains = Field(2.1, description="ell2, eq. (36); above 2")
+    head_l3: Gains = Field(4.3, description="ell3, eq. (36); above 2 + ell2^2 / 2")
+    head_l4: Gains = Field(1.0, description="ell4, eq. (37); above 1/2")
     speed_error_lower_mps: float = Field(-50.0, lt=0, description="-sigma2: least speed difference to the train ahead [m/s], R3")
     speed_error_upper_mps: float = Field(50.0, gt=0, description="sigma1: greatest speed difference to the train ahead [m/s], R3")
     leader_error_lower_m: float = Field(-2351.0, lt=0, description="-rho2 of the train that follows the reference [m], R2")
@@ -106,23 +117,21 @@ class Constants(NamedTuple):
     """The law's constants. Lower bounds are signed (-rho2, ...)."""
 
     first: Ints  # (n + 1,)
-    units: Floats  # (U, 2) d_p behind each unit [m], m / r [kg s]
+    units: Floats  # (U, 5) d_p behind each unit [m], m / r [kg s], l1, l2, l3
     offset: Floats  # (n,) m, front of the head to front of the tail at rest
     distance: Floats  # (n, 4) m, -rho2, rho1, then the part between where the barrier is the printed one
     mixed: Floats  # (n, 4) m/s, -varrho2, varrho1, alike
-    l1: float
-    l2: float
-    l3: float
-    ell1: float
-    ell2: float
-    ell3: float
-    ell4: float
+    ell1: Floats  # (n,), and so on
+    ell2: Floats
+    ell3: Floats
+    ell4: Floats
 
 
 def constants(params: Params, scene: Scene) -> Constants:
     """Constants of the law; see ``ContinuousLaw``."""
     c, links = scene.consists, scene.links
     n = len(scene.trains)
+    carriages = [spread(value, c) for value in (params.carriage_l1, params.carriage_l2, params.carriage_l3)]
     distance, mixed = np.empty((n, 4)), np.empty((n, 4))
     for i in range(n):
         rows = slice(links.first[i], links.first[i + 1])
@@ -132,33 +141,39 @@ def constants(params: Params, scene: Scene) -> Constants:
         else:
             bounds = links.lower[rows][k] - links.desired[rows][k], links.upper[rows][k] - links.desired[rows][k]
         distance[i] = *bounds, 0.999 * bounds[0], 0.999 * bounds[1]
-        bounds = mixed_bounds(params, *bounds)
-        mixed[i] = *bounds, *resolved(params, *bounds, scene.sub_step)
+        bounds = mixed_bounds(params, *bounds, i)
+        mixed[i] = *bounds, *resolved(params, *bounds, scene.sub_step, i)
     return Constants(
-        first=c.first, units=np.column_stack([c.length, c.mass * c.rotating / c.actuator_rate]),
+        first=c.first, units=np.column_stack([c.length, c.mass * c.rotating / c.actuator_rate, *carriages]),
         offset=c.train_length() - c.length[c.first[1:] - 1], distance=distance, mixed=mixed,
-        l1=params.carriage_l1, l2=params.carriage_l2, l3=params.carriage_l3,
-        ell1=params.head_l1_per_s, ell2=params.head_l2, ell3=params.head_l3, ell4=params.head_l4,
+        ell1=of_trains(params.head_l1_per_s, n), ell2=of_trains(params.head_l2, n), ell3=of_trains(params.head_l3, n),
+        ell4=of_trains(params.head_l4, n),
     )  # fmt: skip
 
 
-def mixed_bounds(params: Params, lower: float, upper: float) -> tuple[float, float]:
-    """Bounds (-varrho2, varrho1) of qt [m/s] for bounds (-rho2, rho1) of xt [m]: Remark 2.1."""
-    varrho1 = params.speed_error_upper_mps + params.head_l1_per_s * lower
-    varrho2 = -params.speed_error_lower_mps - params.head_l1_per_s * upper
+def of_train(gains: Gains, train: int) -> float:
+    """The gain of one train's head."""
+    return gains[train] if isinstance(gains, tuple) else gains
+
+
+def mixed_bounds(params: Params, lower: float, upper: float, train: int = 0) -> tuple[float, float]:
+    """Bounds (-varrho2, varrho1) of qt [m/s] for bounds (-rho2, rho1) of xt [m]: Remark 2.1; ``train`` has the gains."""
+    ell1 = of_train(params.head_l1_per_s, train)
+    varrho1 = params.speed_error_upper_mps + ell1 * lower
+    varrho2 = -params.speed_error_lower_mps - ell1 * upper
     return -varrho2, varrho1
 
 
-def resolved(params: Params, lower: float, upper: float, step: float) -> tuple[float, float]:
+def resolved(params: Params, lower: float, upper: float, step: float, train: int = 0) -> tuple[float, float]:
     """Part of (lower, upper) of qt in which a Runge-Kutta step [s] still resolves the barrier, ``(d beta1/d vt)^2 h <= 2``."""
     if not (lower < 0.0 < upper and math.isfinite(lower) and math.isfinite(upper)):
         return lower, upper
-    kept = []
+    kept, ell2, ell3 = [], of_train(params.head_l2, train), of_train(params.head_l3, train)
     for bound in (lower, upper):
         inside, outside = 0.0, 0.999
         for _ in range(40):
             share = 0.5 * (inside + outside)
-            slope = params.head_l2 + params.head_l3 * barrier(share * bound, np.array([lower, upper, lower, upper]))[1]
+            slope = ell2 + ell3 * barrier(share * bound, np.array([lower, upper, lower, upper]))[1]
             inside, outside = (share, outside) if slope * slope * step <= 2.0 else (inside, share)
         kept.append(inside * bound)
     return kept[0], kept[1]
@@ -197,6 +212,7 @@ def demand(
     acceleration, while its jerk fades.
     """
     c = constants
+    ell1, ell2, ell3, ell4 = c.ell1[i], c.ell2[i], c.ell3[i], c.ell4[i]
     k = ahead(desired)
     if k < 0:
         x, v, w, G = leader[0] + slot, leader[1], leader[2], leader[3]
@@ -208,27 +224,26 @@ def demand(
         w, G = leader[2] + dw + FADE * (1.0 - fade) * dG, leader[3] + fade * dG
 
     xt, vt, wt = x - own[0, POSITION], v - own[0, SPEED], w - estimate[0, W]
-    qt = vt + c.ell1 * xt
+    qt = vt + ell1 * xt
     phi_Phi, dphi_Phi = barrier(xt, c.distance[i])
     psi_Psi, dpsi_Psi = barrier(qt, c.mixed[i])
-    beta1 = -phi_Phi - c.ell2 * qt - c.ell3 * psi_Psi
-    beta1_v = -c.ell2 - c.ell3 * dpsi_Psi
-    beta1_x = -dphi_Phi + c.ell1 * beta1_v
-    beta2 = wt + c.ell1 * vt - beta1
+    beta1 = -phi_Phi - ell2 * qt - ell3 * psi_Psi
+    beta1_v = -ell2 - ell3 * dpsi_Psi
+    beta1_x = -dphi_Phi + ell1 * beta1_v
+    beta2 = wt + ell1 * vt - beta1
     # (37) prints -ell4 beta2; (54) needs +
-    w_rate = (
-        G + c.ell1 * wt + c.ell1 * c.ell1 * beta2 - beta1_x * vt - beta1_v * wt + beta1_v * beta1_v * beta2 + qt + c.ell4 * beta2
-    )
+    w_rate = G + ell1 * wt + ell1 * ell1 * beta2 - beta1_x * vt - beta1_v * wt + beta1_v * beta1_v * beta2 + qt + ell4 * beta2
     first = c.first[i]
     for j in range(len(out)):
         if j > 0:  # (29)-(32); w_rate is still that of the carriage in front
-            kappa, damping = c.l1 + 1.0, c.l2 + 1.0 + (c.l1 + 1.0) ** 2
+            kappa = c.units[first + j, 2] + 1.0
+            damping = c.units[first + j, 3] + 1.0 + kappa**2
             z1 = estimate[j, X] - estimate[j - 1, X] + c.units[first + j - 1, 0]
             z2 = estimate[j, V] - estimate[j - 1, V] + kappa * z1
             alpha2 = -z1 - damping * z2 - kappa * (estimate[j, V] - estimate[j - 1, V]) + estimate[j - 1, W]
             z3 = estimate[j, W] - alpha2
             w_rate += (
-                -c.l3 * z3 - z2
+                -c.units[first + j, 4] * z3 - z2
                 - (1.0 + damping * kappa) * (correction[j, X_RATE] - correction[j - 1, X_RATE])
                 - (damping + kappa) * (correction[j, V_RATE] - correction[j - 1, V_RATE])
             )  # fmt: skip
@@ -262,7 +277,7 @@ def watch(i: int, constants: Constants, leader: Floats, first: Ints, own: Floats
         tail = first[j + 1] - 1
         out[0] = own[tail, POSITION] + constants.offset[j] - own[head, POSITION] - links.desired[rows][k]
         out[1] = own[tail, SPEED] - own[head, SPEED]
-    out[2] = out[1] + constants.ell1 * out[0]
+    out[2] = out[1] + constants.ell1[i] * out[0]
 
 
 def watched_bounds(params: Params, scene: Scene) -> tuple[Floats, Floats]:
@@ -273,7 +288,7 @@ def watched_bounds(params: Params, scene: Scene) -> tuple[Floats, Floats]:
     return both[:, :, 0].copy(), both[:, :, 1].copy()
 
 
-def inadmissible(params: Params, spacing_error: float, speed_error: float, lower: float, upper: float) -> list[str]:
+def inadmissible(params: Params, spacing_error: float, speed_error: float, lower: float, upper: float, train: int = 0) -> list[str]:
     """Reasons why a train may not begin to follow another now: start condition (39). Empty: it may.
 
     The rule for joining: a train that comes from another track is linked as soon as this is empty for it and the train ahead
@@ -289,15 +304,18 @@ def inadmissible(params: Params, spacing_error: float, speed_error: float, lower
         vt: speed of the tail of the train ahead minus own [m/s].
     lower, upper : float
         -rho2 and rho1: least and greatest spacing minus the desired one [m].
+    train : int
+        Its place among the trains, for gains of its own.
     """
-    low, high = mixed_bounds(params, lower, upper)
-    q = speed_error + params.head_l1_per_s * spacing_error
+    low, high = mixed_bounds(params, lower, upper, train)
+    ell1 = of_train(params.head_l1_per_s, train)
+    q = speed_error + ell1 * spacing_error
     found = []
     if not lower < spacing_error < upper:
         found.append(f"distance error {spacing_error:.6g} m is not between {lower:g} and {upper:g} m")
     if not low < q < high:
         found.append(
-            f"q = {speed_error:.6g} m/s + {params.head_l1_per_s:g}/s * {spacing_error:.6g} m = {q:.6g} m/s "
+            f"q = {speed_error:.6g} m/s + {ell1:g}/s * {spacing_error:.6g} m = {q:.6g} m/s "
             f"is not between {low:.6g} and {high:.6g} m/s"
         )
     return found
@@ -319,18 +337,26 @@ def errors(constants: Constants, scene: Scene) -> Floats:
 
 def violations(params: Params, scene: Scene) -> list[str]:
     """Every assumption and start condition that fails: (38), (39), R3', links, the reference and the integrator's step."""
-    return [*_gains(params), *_links(params, scene), *_reference(scene), *_start(params, scene)]
+    return _counts(params, scene) or [*_gains(params), *_links(params, scene), *_reference(scene), *_start(params, scene)]
+
+
+def _counts(params: Params, scene: Scene) -> list[str]:
+    """Lists of gains that do not fit the trains."""
+    carriages = [line for key in CARRIAGE for line in miscounted(f"controller.{key}", getattr(params, key), scene.consists)]
+    return carriages + [line for key in HEAD for line in miscounted_trains(f"controller.{key}", getattr(params, key), scene.trains)]
 
 
 def _gains(params: Params) -> Iterator[str]:
     """Conditions (38)."""
-    least = 2.0 + 0.5 * params.head_l2**2
-    if params.head_l2 <= 2.0:
-        yield f"controller.head_l2 = {params.head_l2:g}: must be above 2, condition (38)"
-    if params.head_l3 <= least:
-        yield f"controller.head_l3 = {params.head_l3:g}: must be above 2 + head_l2^2 / 2 = {least:g}, condition (38)"
-    if params.head_l4 <= 0.5:
-        yield f"controller.head_l4 = {params.head_l4:g}: must be above 1/2, condition (38)"
+    pairs = np.broadcast_arrays(np.atleast_1d(params.head_l2), np.atleast_1d(params.head_l3))
+    for l2, l3 in dict.fromkeys(zip(*(row.tolist() for row in pairs), strict=True)):
+        least = 2.0 + 0.5 * l2**2
+        if l2 <= 2.0:
+            yield f"controller.head_l2 = {l2:g}: must be above 2, condition (38)"
+        if l3 <= least:
+            yield f"controller.head_l3 = {l3:g}: must be above 2 + head_l2^2 / 2 = {least:g}, condition (38)"
+    if (l4 := float(np.min(params.head_l4))) <= 0.5:
+        yield f"controller.head_l4 = {l4:g}: must be above 1/2, condition (38)"
 
 
 def _links(params: Params, scene: Scene) -> Iterator[str]:
@@ -356,10 +382,9 @@ def _links(params: Params, scene: Scene) -> Iterator[str]:
                 )
                 continue
         most = min(-params.speed_error_lower_mps / upper, params.speed_error_upper_mps / -lower)
-        if params.head_l1_per_s >= most:
+        if (ell1 := of_train(params.head_l1_per_s, i)) >= most:
             yield (
-                f"controller.head_l1_per_s = {params.head_l1_per_s:g}: must be below min(sigma2 / rho1, sigma1 / rho2) = "
-                f"{most:.4g} for {pair}, R3'"
+                f"controller.head_l1_per_s = {ell1:g}: must be below min(sigma2 / rho1, sigma1 / rho2) = {most:.4g} for {pair}, R3'"
             )
 
 
@@ -380,11 +405,11 @@ def _start(params: Params, scene: Scene) -> Iterator[str]:
     known = constants(params, scene)
     rates = []
     for i, (xt, vt, qt) in enumerate(errors(known, scene)):
-        for rule in inadmissible(params, float(xt), float(vt), float(known.distance[i, 0]), float(known.distance[i, 1])):
+        for rule in inadmissible(params, float(xt), float(vt), float(known.distance[i, 0]), float(known.distance[i, 1]), i):
             yield f"train[{scene.trains[i]}] at {scene.time:g} s: {rule}, start condition (39)"
         if known.mixed[i, 0] < qt < known.mixed[i, 1]:
-            slope = params.head_l2 + params.head_l3 * barrier(qt, known.mixed[i])[1]
-            rates.append(params.head_l1_per_s**2 + slope * slope + params.head_l4)
+            slope = known.ell2[i] + known.ell3[i] * barrier(qt, known.mixed[i])[1]
+            rates.append(float(known.ell1[i] ** 2 + slope * slope + known.ell4[i]))
     if rates and max(rates) * h > STABLE:
         yield f"run.sub_step_s = {h:g}: too large for this start, {max(rates):.3g} 1/s times the step must not exceed {STABLE:g}"
     limited = np.isfinite(np.minimum(np.minimum(c.traction, c.traction_power), np.minimum(c.braking, c.braking_power)))

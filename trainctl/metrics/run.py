@@ -13,6 +13,7 @@ import numpy as np
 from trainctl.errors import InputError
 from trainctl.metrics import driving, traffic
 from trainctl.metrics.values import Values, at_least, at_most, put_worst
+from trainctl.monitors.outcome import GAP
 from trainctl.runs.known import UNBOUNDED, Facts, facts, leader
 from trainctl.runs.run import Run
 from trainctl.runs.series import INSTANT, Pairs, Series, pairs, series
@@ -99,7 +100,8 @@ def metrics(run: Run, *, band_m: float = 1.0, speed_band: float = 0.02, section_
     values |= driving.of_units(trains, units)
     values |= driving.of_energy(trains, units, known)
     values |= driving.of_comfort(trains)
-    values |= traffic.of_trains(trains, section_m)
+    inside = [float(event["value"]) for event in run.events if event["kind"] == "violation" and event.get("bound") == GAP]
+    values |= traffic.of_trains(trains, section_m, inside)
     try:
         values |= traffic.of_sumo(run.folder / "sumo")
     except InputError:

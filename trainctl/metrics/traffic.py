@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +31,10 @@ TRIPINFO = {
 }
 
 DEFINITIONS: dict[str, tuple[str, str]] = {
-    "traffic.gap_min_m": ("m", "Least distance from the rear of the train ahead to the front of a train."),
+    "traffic.gap_min_m": (
+        "m",
+        "Least distance from the rear of the train ahead to the front of a train; negative: they overlap.",
+    ),
     "traffic.spacing_min_m": ("m", "Least distance from front to front of a train and the one ahead."),
     "traffic.spacing_mean_m": ("m", "Mean of that distance over all rows."),
     "traffic.headway_min_s": ("s", "Least spacing over the follower's speed, for trains faster than 1 m/s."),
@@ -66,13 +70,15 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
 }
 
 
-def of_trains(trains: Series, section_m: float | None) -> Values:
-    """Headways and throughput from our own log."""
+def of_trains(trains: Series, section_m: float | None, inside: Sequence[float] = ()) -> Values:
+    """Headways and throughput from our own log; ``inside`` are gaps of trains that were told to overlap, below 0 [m]."""
     if not trains.names:
         return {}
     values: Values = {}
     speed, spacing = trains.column("speed_mps"), trains.column("spacing_m")
     put_worst(values, "traffic.gap_min_m", trains, trains.column("gap_m"), np.minimum)
+    if inside:  # between two rows, or of trains in no formation with each other
+        values["traffic.gap_min_m"] = float(np.fmin(min(inside), np.nanmin([*trains.column("gap_m"), math.inf])))
     put_worst(values, "traffic.spacing_min_m", trains, spacing, np.minimum)
     headway = np.where(speed > MOVING_MPS, spacing / np.maximum(speed, MOVING_MPS), np.nan)
     put_worst(values, "traffic.headway_min_s", trains, headway, np.minimum)

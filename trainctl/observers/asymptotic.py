@@ -19,7 +19,9 @@ p              the observer's pole, n times
 Departures from [1]_
 --------------------
 * (17) prints D1 without ``-r v``. Its derivative must be B1, which contains ``-r``: without it the observer is unstable.
-* At standstill the resistance is zero, as in the plant.
+* At standstill the resistance is zero, as in the plant, and a unit that the plant holds there is known to stand: its estimates
+  settle on that with ``SETTLE``, its fault states go on as (3) says, uncorrected. What the law reads is the motion it would have if
+  it were let go from there. Uncorrected measurements of a unit that does not follow its forces would wind the estimates up.
 
 References
 ----------
@@ -36,9 +38,10 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from trainctl.carriages import Numbers, miscounted, spread
 from trainctl.davis import running_resistance
 from trainctl.kernels import inlined
-from trainctl.signals import POSITION, SPEED, Consists, Floats, Ints, Observer, Scene, Table
+from trainctl.signals import POSITION, SPEED, Bools, Consists, Floats, Ints, Observer, Scene, Table
 
 if TYPE_CHECKING:
     from trainctl.observers import asymptotic
@@ -56,14 +59,24 @@ X, V, W, F = 0, 1, 2, 3
 X_RATE, V_RATE, W_DRIFT, UNCOMPENSATED, STATIC = 0, 1, 2, 3, 4
 
 
+Pole = Annotated[float, Field(lt=0)]
+Poles = Pole | tuple[Pole, ...]
+
+#: How fast estimates of a unit that is held settle on standstill [1/s].
+SETTLE = 20.0
+
+
 class Params(Table):
     """Keys of ``[observer]`` with ``kind = "asymptotic"``. ``compensate = false`` is the paper's law without fault tolerance."""
 
-    pole_per_s: float = Field(-3.0, lt=0, description="The observer's pole, for all its states [1/s]")
-    fault_constant_n_per_s: float = Field(2e5, description="upsilon, jerk force per unit of the constant fault state [N/s]")
-    fault_sinusoids: tuple[Annotated[tuple[float, float], Field(strict=False)], ...] = Field(
-        ((1.0, 2e5),), strict=False, description="[[omega_rad_per_s, nu_omega_n_per_s], ...]: the sinusoids of the fault model"
+    pole_per_s: Poles = Field(-3.0, description="The observer's pole, for all its states [1/s]; one number or one per carriage")
+    fault_constant_n_per_s: Numbers = Field(
+        2e5, description="upsilon, jerk force per unit of the constant fault state [N/s]; one number or one per carriage"
     )
+    fault_sinusoids: tuple[Annotated[tuple[Numbers, Numbers], Field(strict=False)], ...] = Field(
+        ((1.0, 2e5),), strict=False,
+        description="[[omega_rad_per_s, nu_omega_n_per_s], ...]: sinusoids of the fault model; each one number or one per carriage",
+    )  # fmt: skip
     compensate: bool = Field(True, description="false: the fault estimate is left out of the control")
     start_offset_position_m: float = Field(0.0, description="Error of the position estimates at the start [m]; 0: as measured")
     start_offset_speed_mps: float = Field(0.0, description="Error of the speed estimates at the start [m/s]; 0: as measured")
@@ -84,12 +97,12 @@ class Constants(NamedTuple):
     """The observer's constants."""
 
     train: Train
-    k1: float
-    k2: float
-    k3: float
+    k1: Floats  # (U,)
+    k2: Floats  # (U,)
+    k3: Floats  # (U,)
     k4: Floats  # (U, m)
     C: Floats  # (U, m)
-    omega: Floats  # of each sinusoid
+    omega: Floats  # (U, s) of each sinusoid
     compensated: float  # 1 or 0
 
 
@@ -98,7 +111,7 @@ def width(params: Params) -> int:
     return 4 + 2 * len(params.fault_sinusoids)
 
 
-def gains(C: Sequence[float], omega: Sequence[float], pole: float) -> tuple[float, float, float, Floats]:
+def gains(C: Sequence[float] | Floats, omega: Sequence[float] | Floats, pole: float) -> tuple[float, float, float, Floats]:
     """Gains that put every pole of the observer's error at ``pole``, for a constant and any number of sinusoids.
 
     Parameters
@@ -135,12 +148,16 @@ def gains(C: Sequence[float], omega: Sequence[float], pole: float) -> tuple[floa
     return -pole, k2, k3, k4
 
 
-def fault_model(params: Params, mass: float) -> tuple[list[float], list[float]]:
-    """C and omega of one unit with this inertia [kg]."""
-    C = [params.fault_constant_n_per_s / mass]
-    for _, gain in params.fault_sinusoids:
-        C += [0.0, gain / mass]
-    return C, [omega for omega, _ in params.fault_sinusoids]
+def fault_model(params: Params, consists: Consists) -> tuple[Floats, Floats]:
+    """C (U, m) and omega (U, s) of all units."""
+    mass = consists.mass * consists.rotating
+    count = len(params.fault_sinusoids)
+    C, omega = np.zeros((len(mass), 1 + 2 * count)), np.empty((len(mass), count))
+    C[:, 0] = spread(params.fault_constant_n_per_s, consists) / mass
+    for q, (frequency, gain) in enumerate(params.fault_sinusoids):
+        C[:, 2 + 2 * q] = spread(gain, consists) / mass
+        omega[:, q] = spread(frequency, consists)
+    return C, omega
 
 
 def tolerated_speed_offset(params: Params, scene: Scene) -> float:
@@ -150,25 +167,40 @@ def tolerated_speed_offset(params: Params, scene: Scene) -> float:
     other way until it has gone. Measured on the paper's start, without force limits: with poles -1, -2, -3 and -6 this much keeps
     all bounds, with -3 twice as much fails within a second. Common errors of position do no harm: heads measure theirs.
     """
-    return 0.5 * (params.pole_per_s / 3.0) ** 2 * 50.0 / float(scene.consists.actuator_rate.max())
+    slowest = float(np.max(params.pole_per_s))
+    return 0.5 * (slowest / 3.0) ** 2 * 50.0 / float(scene.consists.actuator_rate.max())
 
 
 def violations(params: Params, scene: Scene) -> list[str]:
     """Every reason for which the observer cannot work here."""
-    found = []
-    if params.fault_constant_n_per_s == 0.0:
+    c = scene.consists
+    lists = [("pole_per_s", params.pole_per_s), ("fault_constant_n_per_s", params.fault_constant_n_per_s)]
+    lists += [(f"fault_sinusoids[{k}]", value) for k, pair in enumerate(params.fault_sinusoids, 1) for value in pair]
+    found = [line for key, value in lists for line in miscounted(f"observer.{key}", value, c)]
+    if found:
+        return found
+    if (spread(params.fault_constant_n_per_s, c) == 0.0).any():
         found.append("observer.fault_constant_n_per_s = 0: the constant fault is unobservable, upsilon must not be 0")
-    for k, (omega, gain) in enumerate(params.fault_sinusoids, 1):
-        if omega == 0.0 or gain == 0.0:
-            found.append(f"observer.fault_sinusoids[{k}] = [{omega:g}, {gain:g}]: unobservable, neither may be 0")
-        elif omega < 0.0:
-            found.append(f"observer.fault_sinusoids[{k}] = [{omega:g}, {gain:g}]: omega must be above 0")
-        if omega in [other for other, _ in params.fault_sinusoids[: k - 1]]:
-            found.append(f"observer.fault_sinusoids[{k}] = [{omega:g}, {gain:g}]: unobservable, this omega stands twice")
-    stiff = (3 + 2 * len(params.fault_sinusoids)) * -params.pole_per_s * scene.sub_step
+    omega = fault_model(params, c)[1]
+    for k, (_, given) in enumerate(params.fault_sinusoids):
+        gain, rule = spread(given, c), None
+        if ((omega[:, k] == 0.0) | (gain == 0.0)).any():
+            rule, u = "unobservable, neither may be 0", int(np.argmax((omega[:, k] == 0.0) | (gain == 0.0)))
+        elif (omega[:, k] < 0.0).any():
+            rule, u = "omega must be above 0", int(np.argmax(omega[:, k] < 0.0))
+        if rule is not None:
+            found.append(f"observer.fault_sinusoids[{k + 1}] = [{omega[u, k]:g}, {gain[u]:g}]: {rule}")
+        twice = (omega[:, :k] == omega[:, k : k + 1]).any(axis=1)
+        if twice.any():
+            u = int(np.argmax(twice))
+            found.append(
+                f"observer.fault_sinusoids[{k + 1}] = [{omega[u, k]:g}, {gain[u]:g}]: unobservable, this omega stands twice"
+            )
+    fastest = float(np.min(params.pole_per_s))
+    stiff = (3 + 2 * len(params.fault_sinusoids)) * -fastest * scene.sub_step
     if stiff > 2.5:
         found.append(
-            f"observer.pole_per_s = {params.pole_per_s:g}: too fast for a sub-step of {scene.sub_step:g} s, "
+            f"observer.pole_per_s = {fastest:g}: too fast for a sub-step of {scene.sub_step:g} s, "
             f"{stiff:g} = n |p| h must not exceed 2.5"
         )
     most = tolerated_speed_offset(params, scene)
@@ -194,14 +226,12 @@ def train_of(consists: Consists) -> Train:
 
 def constants(params: Params, scene: Scene) -> Constants:
     """Return gains and model of all trains; call again when the trains change."""
-    train = train_of(scene.consists)
-    models = [fault_model(params, m) for m in train.units[:, MASS]]
-    solved = [gains(C, omega, params.pole_per_s) for C, omega in models]
-    k1, k2, k3, _ = solved[0]
+    C, omega = fault_model(params, scene.consists)
+    poles = spread(params.pole_per_s, scene.consists)
+    k1, k2, k3, k4 = zip(*(gains(*of_unit) for of_unit in zip(C, omega, poles, strict=True)), strict=True)
     return Constants(
-        train, k1, k2, k3, np.array([k4 for *_, k4 in solved]), np.array([C for C, _ in models]),
-        np.array([omega for omega, _ in params.fault_sinusoids], float), float(params.compensate),
-    )  # fmt: skip
+        train_of(scene.consists), np.array(k1), np.array(k2), np.array(k3), np.array(k4), C, omega, float(params.compensate)
+    )
 
 
 def initial(params: Params, own: Floats) -> Floats:
@@ -213,7 +243,7 @@ def initial(params: Params, own: Floats) -> Floats:
 
 
 @inlined()
-def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out: Floats) -> None:
+def correction(i: int, constants: Constants, own: Floats, estimate: Floats, held: Bools, out: Floats) -> None:
     """Right-hand sides of (13) with the corrections (14), without the input; then the force of (5) at u = 0."""
     c, m = constants, constants.train
     first, last = m.first[i], len(own) - 1
@@ -222,20 +252,22 @@ def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out:
         v, vh = own[j, SPEED], estimate[j, V]
         ev = vh - v
         # (17) prints no -r v; dD1/dv = B1 needs it
-        mu2 = (unit[FRONT] + unit[REAR] + unit[C1] + unit[RATE] + c.k2) * ev + unit[C2] * (vh * abs(vh) - v * abs(v))
+        mu2 = (unit[FRONT] + unit[REAR] + unit[C1] + unit[RATE] + c.k2[first + j]) * ev + unit[C2] * (vh * abs(vh) - v * abs(v))
         if j > 0:
             mu2 -= unit[FRONT] * (estimate[j - 1, V] - own[j - 1, SPEED])
         if j < last:
             mu2 -= unit[REAR] * (estimate[j + 1, V] - own[j + 1, SPEED])
-        out[j, X_RATE] = v - c.k1 * (estimate[j, X] - own[j, POSITION])
-        out[j, V_RATE] = estimate[j, W] + mu2
+        out[j, X_RATE] = v - c.k1[first + j] * (estimate[j, X] - own[j, POSITION])
+        out[j, V_RATE] = -SETTLE * ev if held[j] else estimate[j, W] + mu2
     for j in range(last + 1):  # mu3 and the model; the B1(v) w_hat of (13) and the three terms with B1 in mu3 add up to this
         unit = m.units[first + j]
-        drift = own_coefficient(unit, estimate[j, V]) * out[j, V_RATE] + c.k3 * (estimate[j, V] - own[j, SPEED])
-        if j > 0:
-            drift += unit[FRONT] * out[j - 1, V_RATE]
-        if j < last:
-            drift += unit[REAR] * out[j + 1, V_RATE]
+        drift = 0.0
+        if not held[j]:
+            drift = own_coefficient(unit, estimate[j, V]) * out[j, V_RATE] + c.k3[first + j] * (estimate[j, V] - own[j, SPEED])
+            if j > 0:
+                drift += unit[FRONT] * out[j - 1, V_RATE]
+            if j < last:
+                drift += unit[REAR] * out[j + 1, V_RATE]
         fault = 0.0
         for q in range(c.C.shape[1]):
             fault += c.C[first + j, q] * estimate[j, F + q]
@@ -245,7 +277,9 @@ def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out:
 
 
 @inlined()
-def rate(i: int, constants: Constants, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats) -> None:
+def rate(
+    i: int, constants: Constants, own: Floats, estimate: Floats, held: Bools, correction: Floats, applied: Floats, out: Floats
+) -> None:
     """d(estimate)/dt of (13); the input is what was applied after the limits."""
     c, m = constants, constants.train
     for j in range(len(own)):
@@ -255,11 +289,13 @@ def rate(i: int, constants: Constants, own: Floats, estimate: Floats, correction
         out[j, V] = correction[j, V_RATE]
         out[j, W] = correction[j, W_DRIFT] + unit[RATE] / unit[MASS] * (applied[j] - correction[j, STATIC])
         ev = estimate[j, V] - own[j, SPEED]
+        if held[j]:
+            out[j, W], ev = -SETTLE * estimate[j, W], 0.0
         out[j, F] = c.k4[u, 0] * ev
-        for q in range(len(c.omega)):
+        for q in range(c.omega.shape[1]):
             sine, cosine = F + 1 + 2 * q, F + 2 + 2 * q
-            out[j, sine] = c.omega[q] * estimate[j, cosine] + c.k4[u, 1 + 2 * q] * ev
-            out[j, cosine] = -c.omega[q] * estimate[j, sine] + c.k4[u, 2 + 2 * q] * ev
+            out[j, sine] = c.omega[u, q] * estimate[j, cosine] + c.k4[u, 1 + 2 * q] * ev
+            out[j, cosine] = -c.omega[u, q] * estimate[j, sine] + c.k4[u, 2 + 2 * q] * ev
 
 
 def fault_estimate(constants: Constants, estimate: Floats) -> Floats:
@@ -293,6 +329,6 @@ def static_force(i: int, train: Train, own: Floats, out: Floats) -> None:
             dv = v - own[j + 1, SPEED]
             rear = unit[STIFFNESS] * (own[j, POSITION] - own[j + 1, POSITION] - unit[LENGTH]) + unit[DAMPING] * dv
             rear_closing = unit[STIFFNESS] * dv
-        resistance = running_resistance(v, unit[C0], unit[C1], unit[C2])
+        resistance = running_resistance(v, unit[C0], unit[C1], unit[C2]) if v > 0.0 else unit[C0]  # that of moving off
         out[j, STATIC] = rear - stretched + unit[MASS] * resistance + (rear_closing - closing) / unit[RATE]
         stretched, closing = rear, rear_closing

@@ -31,6 +31,7 @@ from trainctl.observers.asymptotic import (
     MASS,
     RATE,
     REAR,
+    SETTLE,
     STATIC,
     UNCOMPENSATED,
     V_RATE,
@@ -44,7 +45,7 @@ from trainctl.observers.asymptotic import (
     static_force,
     train_of,
 )
-from trainctl.signals import POSITION, SPEED, Floats, Observer, Scene, Table
+from trainctl.signals import POSITION, SPEED, Bools, Floats, Observer, Scene, Table
 
 if TYPE_CHECKING:
     from trainctl.observers import intermediate
@@ -118,7 +119,7 @@ def initial(params: Params, own: Floats) -> Floats:
 
 
 @inlined()
-def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out: Floats) -> None:
+def correction(i: int, constants: Constants, own: Floats, estimate: Floats, held: Bools, out: Floats) -> None:
     """Write right-hand sides without the input, as ``asymptotic.correction`` does: mu1 = -3 e_x, mu2 = -L1 e_v, mu3 = -L2 e_v."""
     c, m = constants, constants.train
     first, last = m.first[i], len(own) - 1
@@ -131,14 +132,16 @@ def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out:
         if j < last:
             model += unit[REAR] * estimate[j + 1, W]
         out[j, X_RATE] = estimate[j, V] - c.position_gain * (estimate[j, X] - own[j, POSITION])
-        out[j, V_RATE] = wh - c.L1 * ev
-        out[j, W_DRIFT] = model + estimate[j, XI] + c.kappa * wh - c.L2 * ev
+        out[j, V_RATE] = -SETTLE * ev if held[j] else wh - c.L1 * ev
+        out[j, W_DRIFT] = estimate[j, XI] + c.kappa * wh + (0.0 if held[j] else model - c.L2 * ev)
         out[j, UNCOMPENSATED] = 0.0
     static_force(i, m, own, out)
 
 
 @inlined()
-def rate(i: int, constants: Constants, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats) -> None:
+def rate(
+    i: int, constants: Constants, own: Floats, estimate: Floats, held: Bools, correction: Floats, applied: Floats, out: Floats
+) -> None:
     """d(estimate)/dt; the input is what was applied after the limits."""
     c, m = constants, constants.train
     for j in range(len(own)):
@@ -148,6 +151,9 @@ def rate(i: int, constants: Constants, own: Floats, estimate: Floats, correction
         out[j, V] = correction[j, V_RATE]
         out[j, W] = correction[j, W_DRIFT] + unit[RATE] / unit[MASS] * (applied[j] - correction[j, STATIC])
         out[j, XI] = -c.kappa * (out[j, W] + c.L2 * ev)  # model + f_hat + u, without mu3
+        if held[j]:
+            out[j, W] = -SETTLE * estimate[j, W]
+            out[j, XI] = -c.kappa * out[j, W]  # the fault estimate xi + kappa w stays
 
 
 def fault_estimate(constants: Constants, estimate: Floats) -> Floats:

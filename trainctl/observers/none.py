@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from trainctl.kernels import inlined
-from trainctl.signals import Floats, Observer, Scene, Table
+from trainctl.signals import Bools, Floats, Observer, Scene, Table
 
 if TYPE_CHECKING:
     from trainctl.observers import none
@@ -48,12 +48,14 @@ def initial(params: Params, own: Floats) -> Floats:
 
 
 @inlined()
-def correction(i: int, constants: Constants, own: Floats, estimate: Floats, out: Floats) -> None:
+def correction(i: int, constants: Constants, own: Floats, estimate: Floats, held: Bools, out: Floats) -> None:
     """Nothing to correct."""
 
 
 @inlined()
-def rate(i: int, constants: Constants, own: Floats, estimate: Floats, correction: Floats, applied: Floats, out: Floats) -> None:
+def rate(
+    i: int, constants: Constants, own: Floats, estimate: Floats, held: Bools, correction: Floats, applied: Floats, out: Floats
+) -> None:
     """Nothing to estimate."""
 
 

@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from trainctl import draws
 from trainctl.davis import running_resistance
 from trainctl.kernels import inlined
 from trainctl.plants import coupled_units
@@ -93,6 +94,7 @@ class Constants(NamedTuple):
     units: Floats  # as in coupled_units, then RATE, NOISE
     gradient: Floats  # (G, 2) as in coupled_units
     faults: Faults
+    names: Ints  # (U, 2) whose noise is whose: see ``named``
 
 
 def violations(params: Params, scene: Scene, faults: Sequence[Fault] = ()) -> list[str]:
@@ -133,15 +135,15 @@ def constants(
     faults : sequence of Fault
         That ``violations`` has not refused.
     trains : sequence of str
-        Ids that the faults name, in the order of ``consists``.
+        Ids that the faults name, and by which noise is drawn, in the order of ``consists``.
     """
     first, units, slopes = coupled_units.constants(params, consists, gradient, resistance_factor)
     units = np.column_stack([units, consists.actuator_rate, np.zeros(len(units))])
-    return Constants(first, np.ascontiguousarray(units), slopes, tabulated(faults, trains, consists))
+    return Constants(first, np.ascontiguousarray(units), slopes, tabulated(faults, trains, consists), named(trains, first))
 
 
-def noise(params: Params, seed: int, sample: int, units: int) -> Floats:
-    """Gaussian jerk of every unit in one holding interval, a pure function of seed and sample number.
+def noise(params: Params, seed: int, sample: int, units: int | Ints) -> Floats:
+    """Gaussian jerk of every unit in one holding interval, a pure function of seed, sample number and unit.
 
     Parameters
     ----------
@@ -151,12 +153,12 @@ def noise(params: Params, seed: int, sample: int, units: int) -> Floats:
         Of the run.
     sample : int
         Number of the interval: it begins at ``sample * noise_hold_s``.
-    units : int
-        Of all trains.
+    units : int or ndarray of int, shape (U, 2)
+        ``Constants.names``: a word for the train and the unit's number in it. Or so many units of one nameless train.
 
     Returns
     -------
-    ndarray, shape (units,)
+    ndarray, shape (U,)
         For the column ``NOISE`` of ``Constants.units`` [m/s3].
 
     Notes
@@ -164,8 +166,16 @@ def noise(params: Params, seed: int, sample: int, units: int) -> Floats:
     The paper says "Gaussian, mean 0, variance 0.5" and no more. Read as a jerk, held for 0.1 s: in newtons it would be invisible,
     in m/s2 or in the measured speed nothing would work.
     """
-    draw = np.random.Generator(np.random.Philox(key=seed, counter=[sample, 0, 0, 0])).standard_normal(units)
+    names = named((), np.array([0, units])) if isinstance(units, int) else units
+    draw: Floats = draws.normal(seed, draws.NOISE, np.array([sample]), names)[0]
     return math.sqrt(params.noise_variance_m2_per_s6) * draw
+
+
+def named(trains: Sequence[str], first: Ints) -> Ints:
+    """Two words for every unit, shape (U, 2): of its train, its place where ``trains`` is empty, and its number in the train."""
+    words = [draws.word(name) for name in trains] or list(range(len(first) - 1))
+    count = np.diff(first)
+    return np.column_stack([np.repeat(np.array(words, np.int64), count), np.arange(first[-1]) - np.repeat(first[:-1], count)])
 
 
 def noise_hold(params: Params) -> float | None:
@@ -175,7 +185,7 @@ def noise_hold(params: Params) -> float | None:
 
 def make_noise(params: Params, constants: Constants, seed: int, sample: int | None) -> None:
     """Overwrite the column ``NOISE`` with the sample of that number, or with none."""
-    constants.units[:, NOISE] = 0.0 if sample is None else noise(params, seed, sample, len(constants.units))
+    constants.units[:, NOISE] = 0.0 if sample is None else noise(params, seed, sample, constants.names)
 
 
 def balanced(own: Floats, consists: Consists, gradient: Floats | None = None) -> Floats:
@@ -224,7 +234,7 @@ def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, app
 
     Notes
     -----
-    Departs from the paper: at standstill resistance is zero and a unit is held unless what acts on it drives it forward.
+    Departs from the paper: a unit that stands is held unless what acts on it overcomes the resistance of slow motion, c0.
     """
     a, last = constants.first[i], len(applied) - 1
     traction = braking = resistance = damping = climb = disturbance = 0.0
@@ -243,7 +253,9 @@ def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, app
         acceleration = (tau + pull - rear - drag - weight + push) / unit[INERTIA]
         fault = fault_rate(constants.faults, a + j, t, inside) + unit[INERTIA] * unit[NOISE]
         out[j, POSITION] = v
-        out[j, SPEED] = acceleration if v > 0.0 else max(acceleration, -HOLD * v)
+        if v <= 0.0:  # whoever moves off meets the resistance of motion: without it a unit would start and stop for ever
+            acceleration = max(acceleration - unit[MASS] * unit[C0] / unit[INERTIA], -HOLD * v)
+        out[j, SPEED] = acceleration
         out[j, FORCE] = unit[RATE] * (effectiveness(constants.faults, a + j, inside) * applied[j] - tau) + fault
         traction += max(tau * v, 0.0)
         braking += max(-tau * v, 0.0)

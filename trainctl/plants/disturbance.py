@@ -3,21 +3,16 @@
 They are the w1, w2, w3 of robust_constrained eqs. (1) and (4), an error of the resistance, and noise of the measured positions.
 
 A disturbance is a pure function of the step, the time and the positions, so a resumed run continues with the same numbers. Random
-shapes are counter-based [1]_: the number of a train in a step depends on the seed, the entry, the train's id and the step, on
-nothing drawn before and not on which other trains there are.
+shapes are counter-based (``draws``): the number of a train in a step depends on the seed, the entry, the train's id and the
+step, on nothing drawn before and not on which other trains there are.
 
 Amplitudes of ``position`` and ``speed`` are per simulator step T, as in the paper: 0.1 m each 0.8 s is not 0.1 m each second.
 
 Symbols: w1 position [m], w2 speed [m/s], w3 input [m/s2], k step, T step [s].
-
-References
-----------
-.. [1] Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC11: Philox4x32-10.
 """
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable, Sequence
 from typing import Annotated, Literal, NamedTuple, get_args
@@ -28,6 +23,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from pydantic.json_schema import SkipJsonSchema
 from pydantic_core import PydanticCustomError
 
+from trainctl.draws import WORD, gauss, uniforms, word
 from trainctl.signals import Disturbed, Floats, Ints, Table
 
 #: What a disturbance acts on; the rows of every array of shape (5, n) here.
@@ -210,7 +206,6 @@ ON, SHAPE, TRAIN, BEGIN, START, END, KEY_LOW, KEY_HIGH, WHO, STREAM = range(10)
 # Columns of Signals.number.
 AMPLITUDE, STD, FROM_S, TO_S, FROM_M, TO_M, PERIOD, PHASE = range(8)
 
-WORD = 0xFFFFFFFF
 ROUNDING = 1e-9  # s, of k T
 
 
@@ -286,10 +281,9 @@ def prepare(
             begin = 0
         for name, a, s in zip(named, amplitude, std, strict=True):
             column = np.asarray(entry.values or (), float) if signs is None else signs[entry.channel, :, index[name]]
-            who = int.from_bytes(hashlib.blake2b(name.encode(), digest_size=4).digest(), "little")
             whole.append((
                 entry.channel, SHAPES.index(entry.shape), index[name], begin, start, start + len(column),
-                key & WORD, key >> 32 & WORD, who, stream,
+                key & WORD, key >> 32 & WORD, word(name), stream,
             ))  # fmt: skip
             number.append((
                 scale * a, scale * s, entry.from_s or 0.0, _or(entry.to_s, math.inf), _or(entry.from_m, -math.inf),
@@ -361,30 +355,9 @@ def _evaluate(whole: Ints, number: Floats, table: Floats, k: int, t: float, posi
             at = row[START] + k - row[BEGIN]
             value = a * table[at] if row[START] <= at < row[END] else 0.0
         else:
-            first, second = _uniforms(k, int(row[WHO]), int(row[STREAM]), int(row[KEY_LOW]), int(row[KEY_HIGH]))
+            first, second = uniforms(int(k), int(k) >> 32, int(row[WHO]), int(row[STREAM]), int(row[KEY_LOW]), int(row[KEY_HIGH]))
             if shape == UNIFORM:
                 value = a * (2.0 * first - 1.0)
             else:
-                normal = math.sqrt(-2.0 * math.log(1.0 - first)) * math.cos(2.0 * math.pi * second)
-                value = min(max(real[STD] * normal, -a), a)
+                value = min(max(real[STD] * gauss(first, second), -a), a)
         out[row[ON], i] += value
-
-
-@njit(cache=True)
-def _uniforms(k: int, who: int, stream: int, key_low: int, key_high: int) -> tuple[float, float]:
-    """Two numbers in [0, 1) of 53 random bits each."""
-    w, x, y, z = philox(int(k) & WORD, int(k) >> 32, who, stream, key_low, key_high)
-    return ((w >> 5) * 67108864.0 + (x >> 6)) / 9007199254740992.0, ((y >> 5) * 67108864.0 + (z >> 6)) / 9007199254740992.0
-
-
-@njit(cache=True)
-def philox(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, int, int, int]:
-    """Philox4x32-10 [1]_: four random words of 32 bits from a counter of four and a key of two.
-
-    Products of two words may wrap around in 64-bit integers; the masked words are right all the same.
-    """
-    for _ in range(10):
-        a, b = 0xD2511F53 * c0, 0xCD9E8D57 * c2
-        c0, c1, c2, c3 = (b >> 32 & WORD) ^ c1 ^ k0, b & WORD, (a >> 32 & WORD) ^ c3 ^ k1, a & WORD
-        k0, k1 = k0 + 0x9E3779B9 & WORD, k1 + 0xBB67AE85 & WORD
-    return c0, c1, c2, c3

@@ -23,7 +23,7 @@ from numba.extending import overload
 from trainctl.errors import LawError
 from trainctl.kernels import bare
 from trainctl.plants import shared
-from trainctl.signals import FORCE, POSITION, POWERS, SPEED, Extremes, Floats, Ints, Links, References, evaluate
+from trainctl.signals import FORCE, POSITION, POWERS, SPEED, Bools, Extremes, Floats, Ints, Links, References, evaluate
 
 types: Any = numba.types
 typeof: Any = numba.typeof
@@ -80,6 +80,7 @@ class Scratch(NamedTuple):
     """Work space of one stage, and of the step around it."""
 
     leader: Floats  # (4,)
+    held: Bools  # (U,) the plant holds this unit at standstill; told to observers
     correction: Floats  # (U, c)
     applied: Floats  # (U,)
     own_rate: Floats  # (U, s)
@@ -98,9 +99,9 @@ def scratch(own: Floats, estimate: Floats, trains: int, corrections: int, messag
     """Work space for these shapes."""
     units = len(own)
     return Scratch(
-        np.zeros(4), np.zeros((units, corrections)), np.zeros(units), np.zeros_like(own), np.zeros_like(estimate),
-        np.zeros((trains, len(POWERS))), np.zeros((trains, message)), np.zeros(trains), np.zeros_like(own), np.zeros_like(own),
-        np.zeros_like(estimate), np.zeros_like(estimate), np.zeros(units),
+        np.zeros(4), np.zeros(units, bool), np.zeros((units, corrections)), np.zeros(units), np.zeros_like(own),
+        np.zeros_like(estimate), np.zeros((trains, len(POWERS))), np.zeros((trains, message)), np.zeros(trains), np.zeros_like(own),
+        np.zeros_like(own), np.zeros_like(estimate), np.zeros_like(estimate), np.zeros(units),
     )  # fmt: skip
 
 
@@ -139,7 +140,15 @@ def stage(code, loop, first, links, references, air, t, inside, own, estimate, w
     for i in range(low, high):
         a, b = first[i], first[i + 1]
         if observed:
-            correction(i, loop.observer, own[a:b], estimate[a:b], work.correction[a:b])
+            standing = False
+            for u in range(a, b):
+                work.held[u] = own[u, SPEED] <= 0.0
+                standing = standing or work.held[u]
+            if standing and own.shape[1] > FORCE:  # where the forces are a state they say whether a standing unit moves off
+                rate(i, loop.plant, t, inside, own[a:b], work.applied[a:b], work.own_rate[a:b], work.power[i])
+                for u in range(a, b):
+                    work.held[u] = own[u, SPEED] < 0.0 or (own[u, SPEED] == 0.0 and work.own_rate[u, SPEED] <= 0.0)
+            correction(i, loop.observer, own[a:b], estimate[a:b], work.held[a:b], work.correction[a:b])
         if talk and not air.chain:
             follows = lead(i, follows, references, t, inside, work.leader)
             message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
@@ -167,7 +176,8 @@ def stage(code, loop, first, links, references, air, t, inside, own, estimate, w
         if observed:
             add(lift, -1.0, a, b, work.applied)
             estimate_rate(
-                i, loop.observer, own[a:b], estimate[a:b], work.correction[a:b], work.applied[a:b], work.estimate_rate[a:b]
+                i, loop.observer, own[a:b], estimate[a:b], work.held[a:b], work.correction[a:b], work.applied[a:b],
+                work.estimate_rate[a:b],
             )  # fmt: skip
             add(lift, 1.0, a, b, work.applied)
         if talk and air.chain:

@@ -21,7 +21,7 @@ from trainctl.davis import resistance as resistance
 from trainctl.davis import resistance_of
 from trainctl.plants import faults as actuators
 from trainctl.plants.faults import Fault
-from trainctl.signals import GRAVITY, POSITION, SPEED, Bools, Consists, Floats, PointPlant, Reliance, Scene, Table
+from trainctl.signals import GRAVITY, POSITION, SPEED, Bools, Bounds, Consists, Floats, PointPlant, Reliance, Scene, Table
 
 if TYPE_CHECKING:
     from trainctl.plants import point
@@ -92,20 +92,23 @@ class Moved(NamedTuple):
 
 
 def constants(
-    params: Params, consists: Consists, resistance_factor: Floats | None = None, gradient: Floats | None = None
-) -> Constants:
+    params: Params, consists: Consists, resistance_factor: Floats | None = None, gradient: Floats | None = None,
+    clamps: Bounds | None = None,
+) -> Constants:  # fmt: skip
     """Arrays of the plant; a train of several units gets the mean of their Davis coefficients, weighted by mass.
 
     Parameters
     ----------
     params : Params
-        Clamps, the same for all trains.
+        Clamps, the same for all trains; see ``clamps``.
     consists : Consists
         Units of all trains.
     resistance_factor : ndarray, shape (n,), optional
         True over believed running resistance; 1 if left out.
     gradient : ndarray, shape (G, 2), optional
         Position where a slope begins [m], ascending, and its rise / run; flat if left out.
+    clamps : Bounds, optional
+        U_i and V_i of every train, infinite where nothing clamps, instead of those of ``params``.
 
     Returns
     -------
@@ -116,13 +119,18 @@ def constants(
     def everywhere(value: float | None, otherwise: float) -> Floats:
         return np.full(n, otherwise if value is None else value)
 
+    if clamps is None:
+        clamps = Bounds(
+            everywhere(params.speed_lower_mps, -np.inf), everywhere(params.speed_upper_mps, np.inf),
+            everywhere(params.input_lower_mps2, -np.inf), everywhere(params.input_upper_mps2, np.inf),
+        )  # fmt: skip
     return Constants(
         davis=consists.train_davis(),
         resistance_factor=np.ones(n) if resistance_factor is None else resistance_factor,
-        input_lower=everywhere(params.input_lower_mps2, -np.inf),
-        input_upper=everywhere(params.input_upper_mps2, np.inf),
-        speed_lower=everywhere(params.speed_lower_mps, -np.inf),
-        speed_upper=everywhere(params.speed_upper_mps, np.inf),
+        input_lower=clamps.input_lower,
+        input_upper=clamps.input_upper,
+        speed_lower=clamps.speed_lower,
+        speed_upper=clamps.speed_upper,
         gradient=np.zeros((0, 2)) if gradient is None else gradient,
         slope=np.zeros(n),
     )

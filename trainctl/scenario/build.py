@@ -16,16 +16,15 @@ import sumo_net
 from sumo_net import Line, LineError
 from trainctl.errors import InputError
 from trainctl.laws import find_law, find_observer, find_plant
-from trainctl.scenario import placing, promise, roster
+from trainctl.scenario import limits, placing, promise, roster
 from trainctl.scenario.fit import can_brake, connected, fits
 from trainctl.scenario.model import Prepared
-from trainctl.scenario.plan import bounds_of, initial, plan_of
+from trainctl.scenario.plan import initial, plan_of
 from trainctl.scenario.reading import examine, mistakes, read
 from trainctl.scenario.reference import Profile
 from trainctl.scenario.tables import Scenario
 from trainctl.signals import (
     POSITION,
-    Bounds,
     Plant,
 )  # fmt: skip
 from trainctl.topology import graph
@@ -104,19 +103,20 @@ def prepare(
         raise InputError([f"{file}: {line}" for line in found])
 
     consists = scenario.consists()
-    bounds = bounds_of(scenario, plant, consists)
+    bounds = limits.of_trains(scenario, plant, plant_params, consists)
     # Trains that come and go are checked as the one formation they could be.
     placed = scenario if trains is None else roster.in_formation(scenario, plan.slot)
     own = initial(placed, plant, consists)
     track = np.unique([t.track for t in placed.train], return_inverse=True)[1].astype(np.int64)
-    start = own[0, POSITION] - scenario.topology.first_slot_m
+    front = int(np.argmin(plan.place))
+    start = own[consists.first[front], POSITION] - scenario.topology.first_slot_m
     if scenario.reference.follow_line:
-        followed = attempt(placing.followed, scenario, network and network[0], plan, consists, start)
-        scenario = scenario.model_copy(update={"reference": followed or Profile(speed_mps=scenario.train[0].speed_mps)})
+        followed = attempt(placing.followed, scenario, network and network[0], plan, consists, start, front)
+        scenario = scenario.model_copy(update={"reference": followed or Profile(speed_mps=scenario.train[front].speed_mps)})
     reference = scenario.reference.leader(start)
     first = graph.links(plan, graph.order_on_tracks(own[consists.first[:-1], POSITION], track), track)
     prepared = Prepared(
-        scenario=_resolved(scenario, bounds), file=file, law=law, params=params, plant=plant, plant_params=plant_params,
+        scenario=limits.resolved(scenario, bounds), file=file, law=law, params=params, plant=plant, plant_params=plant_params,
         observer=observer, observer_params=observer_params, consists=consists, own=own, bounds=bounds, reference=reference,
         plan=plan, first_links=first, line=None, spec=None, net=None, roster=None,
     )  # fmt: skip
@@ -177,21 +177,3 @@ def _network(scenario: Scenario, folder: Path, signals_m: Callable[[float | None
         spec = spec.model_copy(update={"signals_m": signals_m(spec.signals_m)})
         spec = sumo_net.parse_spec(spec.model_dump(mode="json", by_alias=True, exclude_none=True), spec.name)
     return Line.of(spec), spec, None
-
-
-def _resolved(scenario: Scenario, bounds: Bounds) -> Scenario:
-    """The scenario as it is logged: with the input bounds that follow from the units, and a law's file by its name alone."""
-    law = scenario.controller.law
-    if law.endswith(".py"):  # a copy of it stands beside the scenario
-        scenario = scenario.model_copy(update={"controller": scenario.controller.model_copy(update={"law": Path(law).name})})
-    if not np.all(np.isfinite(bounds.input_lower) & np.isfinite(bounds.input_upper)):
-        return scenario
-    low, high = bounds.input_lower.tolist(), bounds.input_upper.tolist()
-    if len(set(low)) == len(set(high)) == 1:
-        table = scenario.bounds.model_copy(update={"input_lower_mps2": low[0], "input_upper_mps2": high[0]})
-        return scenario.model_copy(update={"bounds": table})
-    own = [
-        t.model_copy(update={"input_lower_mps2": a, "input_upper_mps2": b})
-        for t, a, b in zip(scenario.train, low, high, strict=True)
-    ]
-    return scenario.model_copy(update={"train": tuple(own)})

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from trainctl.plants import shared
-from trainctl.scenario import promise
+from trainctl.scenario import limits, promise
 from trainctl.scenario.model import Prepared
 from trainctl.topology import graph
 
@@ -52,7 +52,7 @@ def facts(p: Prepared) -> dict[str, Any]:
     if p.supervision.mode != "off" and not p.self_driven:
         found["protection"] = promise.told(p)
         found["promise"] = promise.sentences(found["protection"])
-    notes = list(p.roster.notes)
+    notes = [*p.roster.notes, *limits.differing(p.scenario, p.plant, p.plant_params)]
     found["warnings"] = notes + list(p.law.warnings(p.params, scene, p.start_track)) if hasattr(p.law, "warnings") else notes
     found["report"] = list(p.law.report(p.params, scene, p.scenario.disturbance)) if hasattr(p.law, "report") else []
     if hasattr(p.law, "analysis"):

@@ -6,8 +6,8 @@ import numpy as np
 
 from trainctl.laws import unfit
 from trainctl.plants import disturbance
+from trainctl.scenario.limits import room
 from trainctl.scenario.model import Prepared
-from trainctl.scenario.plan import room
 from trainctl.topology import graph
 
 
@@ -37,16 +37,11 @@ def fits(p: Prepared) -> list[str]:
         ):
             if not low < high:
                 found.append(f"train[{t.id}]: {key} bounds {low:g} .. {high:g} are empty")
-    if getattr(p.law, "CLAMPED", False):
-        for key in p.plant.CLAMPS:
-            clamp, bound = getattr(p.plant_params, key), getattr(p.scenario.bounds, key)
-            if clamp != bound:
-                found.append(f"plant.{key} = {clamp}: must be [bounds] {key} = {bound}, this law's model clamps there")
     if p.self_driven:
         return found + list(p.law.unfit(p.scenario))
     found += [*_messages_fit(p), *_disturbances_fit(p)]
     if p.sampled:
-        least, greatest = room(p.scenario, p.plant, p.consists)
+        least, greatest = room(p.scenario.bounds_of_trains(), p.plant, p.consists)
         for i, t in enumerate(p.scenario.train):
             if p.bounds.input_lower[i] < least[i] - 1e-12:
                 found.append(

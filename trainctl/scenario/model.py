@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from sumo_net import Rails
+from trainctl import draws
 from trainctl.davis import resistance
 from trainctl.plants import disturbance
 from trainctl.railway import supervisor
 from trainctl.railway.authority import DRIVER_MARGIN_M
-from trainctl.scenario import promise
+from trainctl.scenario import limits, promise
 from trainctl.scenario.tables import Scenario, Traffic
 from trainctl.signals import (
     POSITION,
@@ -103,7 +104,17 @@ class Prepared:
     @cached_property
     def sure_braking(self) -> Floats:
         """Deceleration every train can give on the level at any speed it may have [m/s2], shape (n,); infinite for free points."""
-        return self.plant.sure_braking(self.plant_params, self.consists, promise.top_speed(self))
+        given = self.plant.sure_braking(self.plant_params, self.consists, promise.top_speed(self))
+        return np.minimum(given, -self.clamps.input_lower)
+
+    @cached_property
+    def clamps(self) -> Bounds:
+        """Where the plant itself clamps every train, infinite where it does not.
+
+        It does where [plant] says so, and for a law whose model clamps: then at the train's bounds, the tightest of what is said.
+        """
+        everywhere = getattr(self.law, "CLAMPED", False)
+        return limits.clamps(everywhere, self.plant, self.plant_params, self.bounds)
 
     @cached_property
     def assumed(self) -> supervisor.Assumed:
@@ -180,7 +191,8 @@ class Prepared:
         """How messages travel."""
         run, top = self.scenario.run, self.scenario.topology
         period = top.communication_period_s or run.control_period_s or run.step_s
-        return Radio(top.loss, round(top.delay_s / period), top.range_m or np.inf, run.seed or 0)
+        names = np.array([draws.word(name) for name in self.scenario.ids], np.int64)
+        return Radio(top.loss, round(top.delay_s / period), top.range_m or np.inf, run.seed or 0, names)
 
     @property
     def spacing(self) -> convoys.Spacing:

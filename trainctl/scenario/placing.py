@@ -13,11 +13,40 @@ from trainctl.errors import InputError
 from trainctl.plants import shared
 from trainctl.scenario.reference import Profile
 from trainctl.scenario.tables import Event, Scenario
-from trainctl.signals import GRAVITY, Consists
+from trainctl.signals import GRAVITY, Consists, Ints
 from trainctl.topology import graph
 
 if TYPE_CHECKING:
     from trainctl.scenario.model import Prepared
+
+
+def places(scenario: Scenario) -> Ints:
+    """Which every train is in the formation, 0 the first: by where they start, tracks aside; shape (n,).
+
+    Trains of a SUMO configuration, which come and go, keep the order they have.
+    """
+    trains = scenario.train
+    if scenario.network.sumocfg is not None:
+        return np.arange(len(trains))
+    order = sorted(range(len(trains)), key=lambda i: (-trains[i].position_m, trains[i].track))
+    return np.argsort(order)
+
+
+def against_the_order(scenario: Scenario, place: Ints) -> list[str]:
+    """Tables of one track against the order of positions: ``same_track`` makes neighbours of them, front to rear."""
+    if scenario.topology.rule != "same_track" or scenario.network.sumocfg is not None:
+        return []
+    found, last = [], dict[str, int]()
+    for k, t in enumerate(scenario.train):
+        before = last.setdefault(t.track, k)
+        if place[k] < place[before]:
+            other = scenario.train[before]
+            found.append(
+                f"train[{t.id}].position_m = {t.position_m:.10g}: ahead of train {other.id} at {other.position_m:.10g} m, whose"
+                f" table comes before; the [[train]] tables of track {t.track} must go front to rear"
+            )
+        last[t.track] = k
+    return found
 
 
 def limits(line: Line) -> list[tuple[float, float]]:
@@ -34,8 +63,8 @@ def limits(line: Line) -> list[tuple[float, float]]:
     return [(float(places[k]), float(lowest[k])) for k in changed]
 
 
-def followed(scenario: Scenario, line: Line | None, plan: graph.Plan, consists: Consists, start: float) -> Profile:
-    """Return the reference for ``follow_line``, as a table: it stands in the log without the line.
+def followed(scenario: Scenario, line: Line | None, plan: graph.Plan, consists: Consists, start: float, front: int) -> Profile:
+    """Return the reference for ``follow_line``, as a table: it stands in the log without the line; ``front`` is the first train.
 
     Raises
     ------
@@ -43,15 +72,15 @@ def followed(scenario: Scenario, line: Line | None, plan: graph.Plan, consists: 
         If the line's limits cannot be kept, in words.
     """
     if line is None:
-        return Profile(speed_mps=scenario.train[0].speed_mps)  # the line's own mistakes have been told
-    profile, slots = scenario.reference, plan.first_slot - np.concatenate([[0.0], np.cumsum(plan.desired)])
+        return Profile(speed_mps=scenario.train[front].speed_mps)  # the line's own mistakes have been told
+    profile, slots = scenario.reference, plan.slot
     if profile.stop_m is not None and not line.begin_m < profile.stop_m <= line.end_m:
         raise InputError(
             f"reference.stop_m = {profile.stop_m:.10g}: off the line, which is {line.begin_m:.10g} .. {line.end_m:.10g} m"
         )
     rear = float((slots - consists.train_length()).min())
     try:
-        return profile.followed(limits(line), start, scenario.train[0].speed_mps, plan.first_slot, rear)
+        return profile.followed(limits(line), start, scenario.train[front].speed_mps, plan.first_slot, rear)
     except ValueError as error:
         raise InputError(f"reference.follow_line: {error}") from None
 
@@ -142,8 +171,8 @@ def _reroute(
 ) -> tuple[str, float]:
     """Check one reroute as far as it is certain before the run; where the train is afterwards, at least."""
     train = next(t for t in scenario.train if t.id == event.train)
-    slowest = train.speed_lower_mps if train.speed_lower_mps is not None else scenario.bounds.speed_lower_mps
-    passed = max(at_least, train.position_m + max(slowest or 0.0, 0.0) * event.time_s)
+    slowest = max(v for v in (train.speed_lower_mps, scenario.bounds.speed_lower_mps, 0.0) if v is not None)
+    passed = max(at_least, train.position_m + slowest * event.time_s)
     if event.crossover is None:
         if event.to_track not in line.track_ids:
             found.append(f"{here}.to_track = {event.to_track}: no such track; there are: {', '.join(line.track_ids)}")

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 
 from trainctl.errors import InputError
+from trainctl.scenario import placing
 from trainctl.scenario.tables import Scenario
 from trainctl.signals import (
     POSITION,
     SPEED,
-    Bounds,
     Consists,
     Floats,
     Plant,
@@ -33,14 +34,16 @@ def plan_of(scenario: Scenario) -> graph.Plan:
         if link.between:
             low, high = (None if x is None else -x for x in (link.upper_m, link.lower_m))
             said[b, a] = graph.Stated(None if link.desired_m is None else -link.desired_m, low, high, link.weight)
+    place = placing.places(scenario)
+    found += placing.against_the_order(scenario, place)
     rows = []
-    for k in range(len(ids) - 1):
-        own = said.get((k, k + 1), graph.Stated(None, None, None, None))
+    for k, m in pairwise(np.argsort(place).tolist()):
+        own = said.get((k, m), graph.Stated(None, None, None, None))
         desired = own.desired if own.desired is not None else top.spacing_m
         lower = own.lower if own.lower is not None else top.lower_m
         upper = own.upper if own.upper is not None else top.upper_m
         if desired is None:
-            found.append(f"topology.spacing_m: missing, and no [[link]] states desired_m between trains {ids[k]} and {ids[k + 1]}")
+            found.append(f"topology.spacing_m: missing, and no [[link]] states desired_m between trains {ids[k]} and {ids[m]}")
         rows.append((desired or 0.0, -math.inf if lower is None else lower, math.inf if upper is None else upper))
     if top.rule == "links" and not scenario.link and len(ids) > 1:
         found.append('topology.rule = links: there is no [[link]]; rule = "same_track" makes links by itself')
@@ -57,7 +60,7 @@ def plan_of(scenario: Scenario) -> graph.Plan:
         rule=top.rule, equal=top.desired == "equal", first_slot=top.first_slot_m,
         desired=table[:, 0].copy(), lower=table[:, 1].copy(), upper=table[:, 2].copy(), weight=top.weight, stated=said,
         extra=tuple((a, b) for (a, b), link in pairs if link.extra),
-        fixed=tuple(both) if top.rule == "links" else (),
+        fixed=tuple(both) if top.rule == "links" else (), place=place,
     )  # fmt: skip
 
 
@@ -76,22 +79,3 @@ def initial(scenario: Scenario, plant: Plant, consists: Consists) -> Floats:
         own[a:b, POSITION] = t.position_m - back
         own[a:b, SPEED] = t.speed_mps if t.unit_speed_mps is None else t.unit_speed_mps
     return plant.balanced(own, consists)
-
-
-def bounds_of(scenario: Scenario, plant: Plant, consists: Consists) -> Bounds:
-    """The scenario's bounds; where it states no input bounds, what the units can always give within the speed band."""
-    bounds = scenario.bounds_of_trains()
-    least, greatest = room(scenario, plant, consists)
-    return bounds._replace(
-        input_lower=np.where(np.isfinite(bounds.input_lower), bounds.input_lower, least),
-        input_upper=np.where(np.isfinite(bounds.input_upper), bounds.input_upper, greatest),
-    )
-
-
-def room(scenario: Scenario, plant: Plant, consists: Consists) -> tuple[Floats, Floats]:
-    """Input the trains can give anywhere in the speed band, infinite where there is no band."""
-    bounds = scenario.bounds_of_trains()
-    n = len(scenario.train)
-    if not np.all(np.isfinite(bounds.speed_lower) & np.isfinite(bounds.speed_upper)):
-        return np.full(n, -np.inf), np.full(n, np.inf)
-    return plant.room(consists, bounds.speed_lower, bounds.speed_upper)

@@ -88,8 +88,10 @@ def parts(p: Prepared) -> Parts:
     error = greatest[disturbance.RESISTANCE] * resistance(top, c.train_davis())
     fall = GRAVITY * down
     sure = p.plant.relied_on(p.plant_params, c, p.scenario.fault, p.scenario.ids, b, top, fall, DEVIATIONS)
+    given = np.minimum(sure.braking, -p.clamps.input_lower - fall)
+    pull = np.minimum(sure.pull, p.clamps.input_upper)
     return Parts(
-        top=top, fall=fall, climb=GRAVITY * up, given=sure.braking, pull=sure.pull, input=greatest[disturbance.INPUT] + sure.bias,
+        top=top, fall=fall, climb=GRAVITY * up, given=given, pull=pull, input=greatest[disturbance.INPUT] + sure.bias,
         speed=greatest[disturbance.SPEED] / run.step_s, resistance=error + sure.late, noise=sure.noise,
         position=greatest[disturbance.POSITION], measured=greatest[disturbance.MEASUREMENT], lag=sure.lag,
     )  # fmt: skip
@@ -135,8 +137,8 @@ def refusals(p: Prepared) -> list[str]:
     """What of the promise cannot be kept in a scenario with ``mode = "on"``, with the numbers that would do."""
     if p.supervision.mode != "on" or p.self_driven:
         return []
-    clamp = p.plant_params.speed_lower_mps if "speed_lower_mps" in p.plant.CLAMPS else None
-    if clamp is not None and clamp > 0.0:
+    clamp = float(p.clamps.speed_lower.max())
+    if clamp > 0.0:
         return [
             f"plant.speed_lower_mps = {clamp:g}: trains that cannot stand cannot be kept apart; with supervisor.mode = on it must"
             " be 0 or less"

@@ -142,7 +142,7 @@ class Topology(Table):
     )
     desired: Literal["slots", "equal"] = Field(
         "slots",
-        description="slots: every train keeps its place in the order of the [[train]] tables, a hole stays where one leaves; "
+        description="slots: every train keeps its place in the order of the starts, front to rear, a hole stays where one leaves; "
         "equal: neighbours keep spacing_m, the hole closes.",
     )
     spacing_m: Positive | None = Field(None, description="Desired spacing of consecutive trains, front to front [m].")
@@ -256,10 +256,18 @@ class Train(Table):
     speed_mps: NotNegative = Field(description="Speed [m/s].")
     unit_speed_mps: tuple[float, ...] | None = Field(None, description="Speed of each unit [m/s]; default speed_mps.")
     coupler_m: tuple[float, ...] | None = Field(None, description="Displacement of each coupler at the start [m]; default at rest.")
-    speed_lower_mps: float | None = Field(None, description="Own least speed instead of [bounds] [m/s].")
-    speed_upper_mps: float | None = Field(None, description="Own greatest speed instead of [bounds] [m/s].")
-    input_lower_mps2: float | None = Field(None, description="Own least input instead of [bounds] [m/s2].")
-    input_upper_mps2: float | None = Field(None, description="Own greatest input instead of [bounds] [m/s2].")
+    speed_lower_mps: float | None = Field(
+        None, description="Own least speed; the tighter of this, [bounds] and [plant] acts [m/s]."
+    )
+    speed_upper_mps: float | None = Field(
+        None, description="Own greatest speed; the tighter of this, [bounds] and [plant] acts [m/s]."
+    )
+    input_lower_mps2: float | None = Field(
+        None, description="Own least input; the tighter of this, [bounds] and [plant] acts [m/s2]."
+    )
+    input_upper_mps2: float | None = Field(
+        None, description="Own greatest input; the tighter of this, [bounds] and [plant] acts [m/s2]."
+    )
 
 
 class Event(Table):
@@ -355,7 +363,7 @@ class Scenario(Table):
 
     @cached_property
     def ids(self) -> tuple[str, ...]:
-        """Train ids in formation order."""
+        """Train ids in the order of the tables."""
         return tuple(t.id for t in self.train)
 
     def cross_references(self, resolved: bool = False) -> list[str]:
@@ -437,11 +445,12 @@ class Scenario(Table):
         )
 
     def bounds_of_trains(self) -> Bounds:
-        """[bounds] with each train's own values, infinite where nothing is said."""
+        """The tighter of [bounds] and what each train says, infinite where nothing is said."""
 
         def row(key: str, missing: float) -> Any:
-            own = [getattr(t, key) if getattr(t, key) is not None else getattr(self.bounds, key) for t in self.train]
-            return np.array([missing if v is None else v for v in own], float)
+            tighter = max if missing < 0.0 else min
+            said = [[v for v in (getattr(t, key), getattr(self.bounds, key)) if v is not None] for t in self.train]
+            return np.array([tighter(values, default=missing) for values in said], float)
 
         return Bounds(
             speed_lower=row("speed_lower_mps", -math.inf),

@@ -74,7 +74,7 @@ class Points:
         self.step_s = p.scenario.run.step_s
         self.noisy = p.plant.noise_hold(p.plant_params) is not None
         self.plant = cast(PointPlant, p.plant)
-        self.constants = self.plant.constants(p.plant_params, p.consists, gradient=_slopes(p))
+        self.constants = self.plant.constants(p.plant_params, p.consists, gradient=_slopes(p), clamps=p.clamps)
 
     def initial(self) -> State:
         """Nothing to remember."""

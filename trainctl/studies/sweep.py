@@ -17,7 +17,6 @@ import threading
 import time
 import tomllib
 import uuid
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -30,9 +29,6 @@ from trainctl.studies.results import COUNTS, RESULTS, reasons, wilson, write_res
 
 FORMAT = "trainctl sweep"
 INFO, ROWS, FIGURE = "sweep.json", "rows.jsonl", "summary.png"
-
-#: Stream of a run's seed that moves the trains' starts.
-JITTER_STREAM = 3
 
 #: A run whose worker dies is given to another one; after so many deaths it is taken for the cause.
 MOST_DEATHS = 3
@@ -220,16 +216,18 @@ def prepared(job: Job) -> Any:
 
 
 def _move(tables: dict[str, Any], jitter: Mapping[str, float]) -> None:
-    """Add each train's deviation: a function of the seed, the key and the train's place in the list."""
+    """Add each train's deviation: a function of the seed, the key and the train's id."""
     import numpy as np
 
+    from trainctl import draws
+
+    ids = [draws.word(str(train["id"])) for train in tables["train"]]
     for key, width in jitter.items():
         name = key.partition(".")[2]
-        stream = [int(tables["run"]["seed"]), JITTER_STREAM, zlib.crc32(name.encode())]
-        for train, part in zip(
-            tables["train"], np.random.default_rng(stream).uniform(-1.0, 1.0, len(tables["train"])), strict=True
-        ):
-            train[name] = float(train[name] + width * part)
+        who = np.column_stack([ids, np.full(len(ids), draws.word(name))])
+        drawn = draws.uniform(int(tables["run"]["seed"]), draws.JITTER, np.zeros(1, np.int64), who)[0]
+        for train, part in zip(tables["train"], drawn.tolist(), strict=True):
+            train[name] = float(train[name] + width * (2.0 * part - 1.0))
 
 
 # One run

@@ -6,11 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trainctl.signals import Bools, Floats, Links, Messages
+from trainctl import draws
+from trainctl.signals import Bools, Floats, Ints, Links, Messages
 from trainctl.topology.graph import reach
-
-#: Stream of the run's seed that decides which messages are lost.
-LOSS_STREAM = 1
 
 
 class Radio(NamedTuple):
@@ -20,6 +18,7 @@ class Radio(NamedTuple):
     delay: int  # exchange periods
     radius: float
     seed: int
+    names: Ints  # (n,) a word for each train: see ``draws.word``
 
 
 def silent() -> Messages:
@@ -53,7 +52,7 @@ def deliver(radio: Radio, messages: Messages, sent: Floats, position: Floats, li
     links : Links
         Who hears whom.
     count : int
-        Number of the exchange: losses are a function of seed and count alone.
+        Number of the exchange: losses are a function of the seed, the count, the sender and the receiver.
 
     Returns
     -------
@@ -73,6 +72,7 @@ def deliver(radio: Radio, messages: Messages, sent: Floats, position: Floats, li
     if np.isfinite(radio.radius):
         arrives &= reach(position, links, radio.radius)
     if radio.loss > 0.0:
-        arrives &= np.random.default_rng([radio.seed, LOSS_STREAM, count]).random(rows) >= radio.loss
+        pairs = np.column_stack([radio.names[links.sender], radio.names[links.receiver]])
+        arrives &= draws.uniform(radio.seed, draws.LOSS, np.array([count]), pairs)[0] >= radio.loss
     np.copyto(heard, under_way[0][links.sender], where=arrives[:, None])
     return Messages(under_way, heard, ever | arrives), arrives

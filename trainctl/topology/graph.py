@@ -24,9 +24,9 @@ class Stated(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """The scenario's rule, trains in formation order.
+    """The scenario's rule, trains as in its tables; ``place`` (n,) is which each is in the formation, 0 the first.
 
-    ``desired``, ``lower``, ``upper`` (n - 1,) belong to consecutive trains; ``stated`` to (sender, receiver), mirrored where both
+    ``desired``, ``lower``, ``upper`` (n - 1,) belong to consecutive places; ``stated`` to (sender, receiver), mirrored where both
     hear each other; ``extra`` are pairs that hear each other whenever both are on one track, ``fixed`` the directed pairs of rule
     "links".
     """
@@ -41,11 +41,13 @@ class Plan(NamedTuple):
     stated: dict[tuple[int, int], Stated]
     extra: tuple[tuple[int, int], ...]
     fixed: tuple[tuple[int, int], ...]
+    place: Ints
 
     @property
     def slot(self) -> Floats:
         """Wanted position of every train relative to the reference [m], shape (n,)."""
-        return self.first_slot - np.concatenate([[0.0], np.cumsum(self.desired)])
+        slots: Floats = (self.first_slot - np.concatenate([[0.0], np.cumsum(self.desired)]))[self.place]
+        return slots
 
 
 def gaps(plan: Plan, sender: Ints, receiver: Ints, ahead: Bools) -> Floats:
@@ -57,11 +59,12 @@ def gaps(plan: Plan, sender: Ints, receiver: Ints, ahead: Bools) -> Floats:
     if plan.equal:
         begin, end = np.zeros_like(sender), np.ones_like(sender)
     else:
-        begin, end, ahead = np.minimum(sender, receiver), np.maximum(sender, receiver), sender < receiver
+        s, r = plan.place[sender], plan.place[receiver]
+        begin, end, ahead = np.minimum(s, r), np.maximum(s, r), s < r
     bounds = np.column_stack([begin, end]).ravel()
     desired, lower, upper = (
-        np.add.reduceat(np.append(s, 0.0), bounds)[::2] if len(bounds) else np.zeros(0)
-        for s in (plan.desired, plan.lower, plan.upper)
+        np.add.reduceat(np.append(row, 0.0), bounds)[::2] if len(bounds) else np.zeros(0)
+        for row in (plan.desired, plan.lower, plan.upper)
     )
     rows = np.where(ahead, [desired, lower, upper], [-desired, -upper, -lower])
     return np.vstack([rows, np.full(len(sender), plan.weight)])
