@@ -93,7 +93,9 @@ SUMO = Work(
 
 def trainctl(version: str) -> Work:
     """Of trainctl in this version."""
-    return Work("trainctl", "software", (TRAINCTL_AUTHORS,), TRAINCTL_TITLE, TRAINCTL_YEAR, "", {"version": version})
+    return Work(
+        "trainctl", "software", (TRAINCTL_AUTHORS,), TRAINCTL_TITLE, TRAINCTL_YEAR, "", {"version": version} if version else {}
+    )
 
 
 def works(law: str, observer: str, versions: Mapping[str, str], in_sumo: bool) -> tuple[list[Work], list[str]]:

@@ -25,6 +25,8 @@ from trainctl.world import World
 
 #: Slower than this is a stand [m/s].
 STANDS = 1e-9
+#: An observer whose estimates pass this has diverged, though the train it watches may still be where it should.
+ASTRAY = 1e30
 
 
 class State(NamedTuple):
@@ -95,6 +97,8 @@ class Loop(Steps):
         for i, v in around.entries:
             own[p.consists.first[i] : p.consists.first[i + 1], SPEED] = v
             world.insert(i, v)
+        for i in np.flatnonzero(going.parked != s.traffic.parked).tolist():
+            world.park(i, bool(going.parked[i]))
 
         # topology: -> who hears whom, desired spacing and bounds of each link, the law's constants
         seen = here._replace(position=here.position + s.formed.offset)
@@ -130,8 +134,9 @@ class Loop(Steps):
 
         # record, command and step
         watch = s.watch._replace(acting=acts)
-        self.record.step(s.k, t, ways, here, seen, own, formed, demand, moved.motion, past, acting, watch)
-        self.record.waits(t, here, speed, going, around, self.traffic.due(t, going), watch)
+        together = going.on_track(here)
+        self.record.step(s.k, t, ways, together, seen, own, formed, demand, moved.motion, past, acting, watch)
+        self.record.waits(t, together, speed, going, around, self.traffic.due(t, going), watch)
         world.move(moved.motion.displacement, p.scenario.run.step_s)
         formed = self.topology.rule.after(formed)
         return State(
@@ -150,7 +155,7 @@ class Loop(Steps):
         )  # fmt: skip
         units = s.plant if scene is None else self._relinked(t, scene, formed, s.plant, s.watch)
         past, units = self.plant.taken(units)
-        self.record.step(s.k, t, ways, here, seen, own, formed, s.demand, None, past, None, s.watch)
+        self.record.step(s.k, t, ways, going.on_track(here), seen, own, formed, s.demand, None, past, None, s.watch)
         missing = self.traffic.missing(t, going)
         self.not_entered = len(missing)
         if missing:
@@ -238,6 +243,10 @@ class Loop(Steps):
             before = [line for i in wrong if (line := self._acted(i, own, demand, motion))]
             why = "; ".join(before) or "nothing was held, limited or saturated, so the law or its step diverged by itself"
             raise LawError(f"the state of train {names} is no longer finite after {t:g} s: {why}")
+        astray = np.flatnonzero(~(np.abs(moved.state.estimate) < ASTRAY).all(axis=1))
+        if len(astray):
+            names = ", ".join(dict.fromkeys(self.p.scenario.ids[i] for i in np.searchsorted(self.p.heads, astray, "right") - 1))
+            raise LawError(f"the estimates of train {names} passed {ASTRAY:g} after {t:g} s: its observer diverged")
         for i in np.flatnonzero(motion.clipped).tolist():
             self.journal.event(t, "limit", train=self.p.scenario.ids[i], what="backwards", note="held at standstill")
 

@@ -56,6 +56,9 @@ class Numeric:
         """Put a train on the net."""
         self.coming.append(train)
 
+    def park(self, train: int, off: bool) -> None:
+        """It stays where it stands: nobody here is in anybody's way."""
+
     def linked(self, links: Links, formation: Ints) -> None:
         """Nobody looks."""
 

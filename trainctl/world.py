@@ -30,6 +30,9 @@ class World(Protocol):
     def insert(self, train: int, speed: float) -> None:
         """Put a train on the net where it was to start; it is there after the next ``move``."""
 
+    def park(self, train: int, off: bool) -> None:
+        """Take a train that stands off its track, or put it back: both come with the next ``move``, in which it stands."""
+
     def linked(self, links: Links, formation: Ints) -> None:
         """Who hears whom from now on, and which formation (n,) every train is in: for simulators that show it."""
 

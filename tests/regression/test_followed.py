@@ -10,7 +10,7 @@ import pytest
 import tomli_w
 from beside import followed, plain
 
-from trainctl.runner import run
+from trainctl.runner import resume, run
 from trainctl.runs.run import Run
 from trainctl.scenario.build import open_scenario
 
@@ -156,3 +156,42 @@ def test_what_is_not_followed_is_in_the_events_and_on_the_page(folder):
     from trainctl.report.page import page
 
     assert "1 x &lt;vehicle flavour&gt;: not followed" in page(found)
+
+
+PARKED = '<stop lane="bc_0" endPos="1000" duration="200" parking="true"/>'
+
+
+def test_a_train_that_parks_lets_others_pass(folder):
+    found = followed(folder, nets.train("x", "ab bc cd", 0, PARKED) + nets.train("y", "ab bc cd", 60), 600)
+    arrived = {e["train"]: e["time_s"] for e in events(found, "arrive")}
+    [left] = events(found, "stop_left")
+    assert arrived["y"] < left["time_s"] < arrived["x"]
+    assert (found.folder / "sumo" / "collisions.xml").read_text().count("<collision ") == 0
+    sumo = {row["id"]: float(row["arrival"]) for row in plain(folder, "tripinfo", "--railsignal-moving-block")}
+    assert sumo["y"] < sumo["x"]
+
+
+def test_a_parked_train_comes_back_when_nobody_is_in_its_place(folder):
+    """The other one stands in its place when its time is over."""
+    other = '<stop lane="bc_0" endPos="1010" duration="300"/>'
+    found = followed(folder, nets.train("x", "ab bc cd", 0, PARKED) + nets.train("y", "ab bc cd", 60, other), 750)
+    left = {e["train"]: e["time_s"] for e in events(found, "stop_left")}
+    assert left["x"] > left["y"] > 400.0
+    assert {e["train"] for e in events(found, "arrive")} == {"x", "y"}
+
+
+def test_a_run_goes_on_from_a_checkpoint_while_a_train_is_parked(folder):
+    nets.traffic(folder, nets.train("x", "ab bc cd", 0, PARKED) + nets.train("y", "ab bc cd", 60))
+    (folder / "s.toml").write_text(tomli_w.dumps(nets.scenario("robust_constrained", 350)))
+    p = open_scenario(str(folder / "s.toml"))
+    whole = run(p, folder / "whole")
+
+    def dies(steps: int, _: int) -> None:
+        if steps >= 260:
+            raise RuntimeError("killed")
+
+    with pytest.raises(RuntimeError):
+        run(p, folder / "cut", progress=dies, checkpoint_every_s=50.0)
+    again, since = resume(folder / "cut")
+    assert since == 250.0
+    assert again.trains.equals(whole.trains) and again.events == whole.events

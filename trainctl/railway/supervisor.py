@@ -32,11 +32,13 @@ no margin touched: before a fixed point ``d >= D(v)``, behind a moving train ``d
    is taken at ``v + drift`` with the sure braking, D of the train ahead with the hardest, and ``scatter`` is taken off the
    greatest acceleration. A train that brakes more weakly than the one ahead comes nearest at the end or now (while the closing
    speed is positive it grows), so 2. holds with ``braking <= hardest``.
-4. An actuator of lag r follows what is ordered late: ``a' = (u - a) / r``. Under full braking the speed ``v + r (a + braking)``
-   falls just as that of a train without lag, and is never below v, so it takes the place of v before points; before speed limits
-   ``v + r max(a, 0)`` does, the speed reached once no more is ordered. Where the slope changes by ds the force follows late too,
-   which gives the speed ``r g ds``; over a whole route that is at most ``surge``. Couplers that swing may speed up the head by
-   ``swing``, what their energy and that of the units against each other can give it.
+4. An actuator of lag r follows what is ordered late: ``a' = (u - a) / r``. Under full braking the speed ``v + r (a + braking +
+   scatter)`` falls just as that of a train without lag, and is never below v, so it takes the place of v before points; before
+   speed limits ``v + r max(a + scatter, 0)`` does, the speed reached once no more is ordered. The a of an actuator leaves out
+   what acts beside it, up to ``scatter``; and v still rises while the one is negative and their sum is not. Where the slope
+   changes by ds the force follows late too, which gives the speed ``r g ds``; over a whole route that is at most ``surge``.
+   Couplers that swing may speed up the head by ``swing``, what their energy and that of the units against each other can give
+   it.
 
 Holding the speed v behind a train of the same speed therefore needs v T beyond the margin: the train ahead may begin to brake
 now, its follower learns of it one step later.
@@ -119,6 +121,7 @@ class Assumed(NamedTuple):
     surge: Floats  # m/s, >= 0: its speed may rise by this where the slope changes and its actuators follow late
     uncertainty: Floats  # m, >= 0, of its measured position
     blur: float  # m/s, of every measured speed
+    within: bool = False  # trains may stop within a step and stand for the rest of it, not at its end only
 
 
 class Targets(NamedTuple):
@@ -278,7 +281,7 @@ class _Braking(NamedTuple):
 def _braking(params: Params, relied: Assumed, speed: Floats, now: Floats, targets: Targets, step: float, theta: float) -> _Braking:
     i, j = targets.train, targets.other
     a_train, opposing, stop = targets.kind == TRAIN, targets.kind == OPPOSING, targets.kind == STOP
-    more = relied.drift + relied.surge + relied.lag * np.maximum(now + relied.braking, 0.0)
+    more = relied.drift + relied.surge + relied.lag * np.maximum(now + relied.braking + relied.scatter, 0.0)
     v, b = speed[i] + np.where(stop, relied.drift[i], more[i]), relied.braking[i]  # the room to a stop counts the lag already
     own = stopping_distance(v, b, step, theta)
     margin: Floats | float = params.margin_m
@@ -286,7 +289,10 @@ def _braking(params: Params, relied: Assumed, speed: Floats, now: Floats, target
         margin = margin + relied.uncertainty[i] + np.where(j >= 0, relied.uncertainty[j], 0.0)
     room = np.minimum(targets.room, _FAR) - np.where(stop, 0.0, margin)
     follows = a_train & targets.moving & (params.curve == "relative")
-    away = stopping_distance(np.maximum(targets.speed - relied.blur, 0.0), relied.hardest[j], step, theta)
+    slowest = np.maximum(targets.speed - relied.blur, 0.0)
+    away = stopping_distance(slowest, relied.hardest[j], step, theta)
+    if relied.within:
+        away = np.minimum(away, 0.5 * slowest**2 / relied.hardest[j])
     to_stop = np.where(follows, room + away, room)
     if (meets := opposing & targets.moving).any():
         comes = stopping_distance(targets.speed + np.where(j >= 0, more[j], 0.0), relied.braking[j], step, theta)
@@ -330,7 +336,7 @@ def _before_limits(
     params: Params, relied: Assumed, speed: Floats, now: Floats, swing: Floats | float, limits: Limits, step: float, theta: float
 ) -> Floats:
     """Greatest acceleration each limit leaves its train [m/s2], shape (k,)."""
-    settled = speed + swing + (relied.lag * np.maximum(now, 0.0) if relied.lag.any() else 0.0)
+    settled = speed + swing + (relied.lag * np.maximum(now + relied.scatter, 0.0) if relied.lag.any() else 0.0)
     train = limits.train
     v, top = settled[train], settled[train] + (params.greatest_mps2 + relied.scatter[train]) * step
     rate = np.full(len(v), np.inf)

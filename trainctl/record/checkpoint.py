@@ -84,9 +84,11 @@ class Tape:
 
     def __init__(self, world: World, folder: Path, saved: Saved | None = None) -> None:
         self.world, self.path = world, folder / MOVES
-        told: dict[str, Any] = saved.values["tape"] if saved else {"steps": 0, "trains": 0, "crc": 0, "routes": [], "entries": []}
+        told: dict[str, Any] = (
+            saved.values["tape"] if saved else {"steps": 0, "trains": 0, "crc": 0, "routes": [], "entries": [], "parked": []}
+        )
         self.steps, self.trains, self.crc = told["steps"], told["trains"], told["crc"]
-        self.routes, self.entries = list(told["routes"]), list(told["entries"])
+        self.routes, self.entries, self.parked = list(told["routes"]), list(told["entries"]), list(told["parked"])
         self.buffer = bytearray()
         # unbuffered: what did not fit on the disk must not come back when the file is closed
         self.file = open(self.path, "r+b" if saved else "wb", buffering=0)  # noqa: SIM115  closed by close()
@@ -108,7 +110,7 @@ class Tape:
 
     def replay(self, step: float) -> None:
         """Tell the world, which has just started, everything once more."""
-        routes, entries = _by_step(self.routes), _by_step(self.entries)
+        routes, entries, parked = _by_step(self.routes), _by_step(self.entries), _by_step(self.parked)
         rows = max(1, PIECE // (8 * max(self.trains, 1)))
         with self.path.open("rb") as file:
             for k in range(self.steps):
@@ -118,6 +120,8 @@ class Tape:
                     self.world.route(train, tuple(edges))
                 for train, speed in entries.get(k, ()):
                     self.world.insert(train, speed)
+                for train, off in parked.get(k, ()):
+                    self.world.park(train, off)
                 self.world.move(piece[k % rows].copy(), step)
 
     def start(self, start: Start) -> None:
@@ -138,6 +142,11 @@ class Tape:
         """Put a train on the net."""
         self.entries.append((self.steps, train, speed))
         self.world.insert(train, speed)
+
+    def park(self, train: int, off: bool) -> None:
+        """Take a train off its track, or put it back."""
+        self.parked.append((self.steps, train, off))
+        self.world.park(train, off)
 
     @property
     def ways(self) -> Ways:
@@ -167,7 +176,8 @@ class Tape:
         """Everything told until now, safe on the disk, as a checkpoint names it."""
         self._flush()
         os.fsync(self.file.fileno())
-        return {"steps": self.steps, "trains": self.trains, "crc": self.crc, "routes": self.routes, "entries": self.entries}
+        told = {"routes": self.routes, "entries": self.entries, "parked": self.parked}
+        return {"steps": self.steps, "trains": self.trains, "crc": self.crc, **told}
 
     def close(self) -> None:
         """End the simulation and its logs."""

@@ -117,6 +117,7 @@ def assume(p: Prepared) -> Assumed:
         surge=found.lag * (found.fall + found.climb),
         uncertainty=found.measured + (rules.position_uncertainty_m or 0.0),
         blur=rules.speed_uncertainty_mps or 0.0,
+        within=bool(p.plant.UNITS),
     )
 
 

@@ -32,6 +32,7 @@ class Stop(NamedTuple):
     until: float  # s, it does not leave before; -inf if it may
     name: str
     passing: float = 0.0  # m/s, it does not stand but passes with at most this speed; 0: it stands
+    parks: bool = False  # it leaves the track meanwhile, and others pass
 
 
 class Roster(NamedTuple):
@@ -238,7 +239,9 @@ def _stops(departure: Departure, rails: Rails, way: Ints, begin: Floats, begin_s
             raise ValueError(f"stop on edge {stop.edge} at {stop.position_m:g} m: lies behind the departure or the stop before")
         row, last = row + int(ahead[0]), stop.position_m
         until = -math.inf if stop.until_s is None else stop.until_s - begin_s
-        found.append(Stop(float(begin[row] + stop.position_m), stop.duration_s, until, stop.name or stop.edge, stop.pass_mps))
+        found.append(
+            Stop(float(begin[row] + stop.position_m), stop.duration_s, until, stop.name or stop.edge, stop.pass_mps, stop.parks)
+        )
     return tuple(found)
 
 

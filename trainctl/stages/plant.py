@@ -252,22 +252,23 @@ class Units:
         return Moved(moved, motion, messages, state._replace(heard=air.heard, sent_at=air.sent_at, counted=counted))
 
     def _asked(self, own: Floats, moved: Floats, displacement: Floats, mean: Floats) -> Floats:
-        """Acceleration that drives every train over the step [m/s2], (n,).
+        """Acceleration that drives every train over the step [m/s2], (n,); NaN where it stops harder than full braking.
 
         Where actuators lag it is what they approach; else the mean, or the one that explains the displacement where that is more (a
         law pulls first and brakes later within the step) or less than full braking (it brakes first).
         """
-        heads = self.p.heads
+        heads, full = self.p.heads, self.p.supervision.emergency_mps2
         v, after = own[heads, SPEED], moved[heads, SPEED]
-        mean = np.where(after > 0.0, mean + (self.swing(moved) - self.swing(own)) / self.step_s, mean)
+        drives = mean + (self.swing(moved) - self.swing(own)) / self.step_s
         if self.p.plant.STATES > FORCE:
-            gained = self.lag * (np.maximum(self.acceleration(moved), 0.0) - np.maximum(self.acceleration(own), 0.0)) / self.step_s
-            return np.where(after > 0.0, mean + gained, mean)
-        beyond = displacement - 0.5 * (v + after) * self.step_s
-        explained = mean + 2.0 * beyond / self.step_s**2
-        swings = (np.abs(beyond) > WITHIN_M * self.step_s) & (after > 0.0)
-        counts = (explained > mean) | (explained < -self.p.supervision.emergency_mps2)
-        return np.where(swings & counts, explained, mean)
+            drives += self.lag * (np.maximum(self.acceleration(moved), 0.0) - np.maximum(self.acceleration(own), 0.0)) / self.step_s
+        else:
+            beyond = displacement - 0.5 * (v + after) * self.step_s
+            explained = mean + 2.0 * beyond / self.step_s**2
+            swings = (np.abs(beyond) > WITHIN_M * self.step_s) & ((explained > drives) | (explained < -full))
+            drives = np.where(swings, explained, drives)
+        hard = (v > 0.0) & (displacement < 0.5 * v**2 / full - WITHIN_M * self.step_s)
+        return np.where(after > 0.0, drives, np.where(hard, np.nan, mean))
 
     def _climbing(self, own: Floats) -> Floats:
         """Weight along the track per mass [N/kg], (U,)."""

@@ -35,6 +35,7 @@ class State(NamedTuple):
     next_stop: Ints  # number of it in the roster
     stands_until: Floats  # s, while a train stands at a stop, else NaN
     stopping: Bools  # for its next stop
+    parked: Bools  # off the track, at a stop
     waits_for: Ints  # train that each is held by at a switch, -1 if none
     claims: interlocking.State
 
@@ -43,6 +44,10 @@ class State(NamedTuple):
         """Trains that stand at a stop."""
         stands: Bools = ~np.isnan(self.stands_until)
         return stands
+
+    def on_track(self, seen: Seen) -> Seen:
+        """Trains as they are to each other: who is parked is not there."""
+        return seen._replace(present=seen.present & ~self.parked) if self.parked.any() else seen
 
 
 class Around(NamedTuple):
@@ -82,7 +87,8 @@ class Traffic:
         n = len(self.length)
         return State(
             came=np.full(n, self.roster.placed), left=np.zeros(n, bool), next_stop=np.zeros(n, np.int64),
-            stands_until=np.full(n, np.nan), stopping=np.zeros(n, bool), waits_for=np.full(n, -1), claims=interlocking.none(),
+            stands_until=np.full(n, np.nan), stopping=np.zeros(n, bool), parked=np.zeros(n, bool),
+            waits_for=np.full(n, -1), claims=interlocking.none(),
         )  # fmt: skip
 
     def step(
@@ -98,9 +104,9 @@ class Traffic:
         for i in [] if s.came.all() else np.flatnonzero(~s.came & self._given_up(t) & ~self._given_up(t - self.step_s)).tolist():
             self.journal.event(t, "given_up", train=self.p.scenario.ids[i], planned_s=float(self.roster.depart[i]))
         s, stops, soon = self._stops(t, seen, speed, overrun, s)
-        reach = self._reach(speed)
-        s, held, entries, kept_out = self.entering(t, ways, seen, speed, s, [] if last else self.due(t, s), reach)
-        present = seen.present.copy()
+        asking, reach = [] if last else [*self._returning(t, s), *self.due(t, s)], self._reach(speed)
+        s, held, entries, kept_out = self.entering(t, ways, s.on_track(seen), speed, s, asking, reach)
+        present = s.on_track(seen).present.copy()
         present[[i for i, _ in entries]] = True
         view = self._look(ways, seen._replace(present=present), speed, held, s, self._reach(speed) if entries else reach)
         return s, Around(entries, stops, soon, held, kept_out, view)
@@ -142,12 +148,18 @@ class Traffic:
         asking = np.zeros(len(speed), bool)
         asking[due] = True
         s, held = self._claim(t, ways, here, self._reach(speed) if reach is None else reach, asking, s)
+        s = s._replace(parked=s.parked.copy(), stands_until=s.stands_until.copy())
         present, came, come, kept_out = here.present.copy(), s.came.copy(), [], {}
         for i in due:
             if held.room[i] <= 0.0:
                 continue
             present[i] = True
             view = self._look(ways, here._replace(present=present), speed, held, s, self._reach(speed))
+            if s.parked[i]:
+                present[i] = self._may_return(i, speed, view)
+                if present[i]:  # and stands for one more step, the one in which it comes back
+                    s.parked[i], s.stands_until[i] = False, t + self.step_s
+                continue
             v = self._entering_speed(i, ways, here, speed, view, s)
             present[i] = v is not None
             if v is None:
@@ -185,17 +197,32 @@ class Traffic:
             return None
         if view.fouling[i] or np.any(view.clear.room[view.clear.other == i] < 0.0):  # another would be under it, or its tail
             return None
+        return None if self._startles(i, entry, speed, view) else entry
+
+    def _startles(self, i: int, entry: float, speed: Floats, view: View) -> bool:
+        """Whether others would have to brake hard for a train that comes with the speed ``entry``."""
         trial = speed.copy()
         trial[i] = entry
         behind = view.targets.other == i
-        if behind.any():
-            asked = authority.of(view.targets, behind)
-            seen = supervisor.verdict(
-                rules, trial, asked, supervisor.no_limits(), self.step_s, self.theta, self.assumed, np.zeros(len(speed))
-            )
-            if np.any(seen.emergency[view.targets.train[behind]]):
-                return None
-        return entry
+        if not behind.any():
+            return False
+        asked = authority.of(view.targets, behind)
+        seen = supervisor.verdict(
+            self.rules, trial, asked, supervisor.no_limits(), self.step_s, self.theta, self.assumed, np.zeros(len(speed))
+        )
+        return bool(np.any(seen.emergency[view.targets.train[behind]]))
+
+    def _returning(self, t: float, s: State) -> list[int]:
+        """Trains that are parked and may go on."""
+        back: list[int] = np.flatnonzero(s.parked & (s.stands_until <= t + 1e-9)).tolist()
+        return back
+
+    def _may_return(self, i: int, speed: Floats, view: View) -> bool:
+        """Whether a parked train finds its place on the track free; ``view`` has it there."""
+        ahead = authority.of(view.targets, (view.targets.train == i) & (view.targets.other >= 0))
+        if np.any(ahead.room < self.rules.margin_m) or view.fouling[i] or np.any(view.clear.room[view.clear.other == i] < 0.0):
+            return False
+        return not self._startles(i, 0.0, speed, view)
 
     # Stops
 
@@ -215,13 +242,15 @@ class Traffic:
         if not self.stops_of.any():
             return s, nothing(n).stops, np.zeros(n, bool)
         standing = s.standing
-        s = s._replace(next_stop=s.next_stop.copy(), stands_until=s.stands_until.copy(), stopping=s.stopping.copy())
+        s = s._replace(
+            next_stop=s.next_stop.copy(), stands_until=s.stands_until.copy(), stopping=s.stopping.copy(), parked=s.parked.copy()
+        )  # fmt: skip
         for i in np.flatnonzero(seen.present & (s.next_stop < self.stops_of)).tolist():
             stop = self.stop_of(i, s)
             assert stop is not None
             room = stop.place - float(seen.position[i])
             if standing[i]:
-                if t < s.stands_until[i] - 1e-9:
+                if t < s.stands_until[i] - 1e-9 or s.parked[i]:
                     continue
                 s.stands_until[i] = np.nan
                 s.next_stop[i] += 1
@@ -242,6 +271,7 @@ class Traffic:
             if not stop.passing and speed[i] < STANDS_MPS and room < STOP_BAND_M:
                 s.stands_until[i] = max(t + stop.duration, stop.until)
                 self.journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=room)
+                s.parked[i] = stop.parks
                 continue
             trains.append(i)
             rooms.append(max(room - float(overrun[i]), 0.0) + self._further(stop, i))

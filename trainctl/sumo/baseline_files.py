@@ -22,6 +22,7 @@ class Stop(NamedTuple):
     end_m: float  # its front, from the beginning of the edge
     duration: float  # s
     until: float  # s, not before; -inf if it may
+    parks: bool  # off the track
 
 
 class Departure(NamedTuple):
@@ -96,7 +97,7 @@ def _coming(p: Prepared) -> list[Departure]:
         stops = []
         for stop in roster.stops[i]:
             row = int(np.searchsorted(begin, stop.place, side="left")) - 1
-            stops.append(Stop(rails.edges[way[row]], float(stop.place - begin[row]), stop.duration, stop.until))
+            stops.append(Stop(rails.edges[way[row]], float(stop.place - begin[row]), stop.duration, stop.until, stop.parks))
         # Whoever would start faster than it may is refused by SUMO, in the middle of the run.
         speed = min(float(roster.speed[i]), float(roster.speed_factor[i] * rails.speed_mps[way[0]]))
         top = p.params.top_speed_mps
@@ -129,7 +130,13 @@ def write_routes(p: Prepared, trains: list[Departure], path: Path) -> None:
         lines.append(f'    <vehicle{_words(given)}><route edges="{" ".join(normal(d.route))}"/>')
         for stop in d.stops:
             until = None if np.isinf(stop.until) else f"{stop.until:.3f}"
-            said = {"lane": f"{stop.edge}_0", "endPos": repr(stop.end_m), "duration": f"{stop.duration:.3f}", "until": until}
+            said = {
+                "lane": f"{stop.edge}_0",
+                "endPos": repr(stop.end_m),
+                "duration": f"{stop.duration:.3f}",
+                "until": until,
+                "parking": "true" if stop.parks else None,
+            }
             lines.append(f"        <stop{_words(said)}/>")
         lines.append("    </vehicle>")
     path.write_text("\n".join([*lines, "</routes>", ""]), encoding="utf-8")

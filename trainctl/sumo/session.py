@@ -44,6 +44,9 @@ IDLE_S = 1e6
 #: Closer than this to the end of its edge, or beyond, SUMO plans the step.
 PLANNED_M = 1.0
 
+#: A stop that a train parks at, until it is told to resume: its time [s], and the flag that says so.
+PARKS_S, PARKING = 1e6, 1
+
 #: What SUMO says about drivers who decide so rarely.
 OF_IDLING = ("Warning: Given action step length", "Warning: Action step length")
 
@@ -257,6 +260,7 @@ class Sumo(Session):
         self.arrival = np.full(len(self.ids), np.inf) if start.arrival is None else start.arrival
         self.way_end = self._way_end()
         self.coming: list[tuple[int, float]] = []
+        self.returning: list[int] = []
         self._begin(configuration)
         everyone = np.flatnonzero(start.present)
         self._verify_insertion(everyone, start.speed[everyone])
@@ -350,6 +354,21 @@ class Sumo(Session):
         )  # fmt: skip
         self.coming.append((train, speed))
 
+    def park(self, train: int, off: bool) -> None:
+        """Let a train that stands leave its lane, by a stop without an end, or come back to it."""
+        name, vehicle = self.ids[train], self.api.vehicle
+        if not off:
+            self._call(vehicle.resume, name)
+            self.returning.append(train)
+            return
+        edge, place = vehicle.getRoadID(name), vehicle.getLanePosition(name)
+        # A driver that never decides does not see his stop.
+        self._call(vehicle.setActionStepLength, name, self.time_step)
+        self._call(
+            vehicle.setStop, name, edge, pos=place, laneIndex=vehicle.getLaneIndex(name), duration=PARKS_S, flags=PARKING,
+            startPos=max(place - 1.0, 0.0),
+        )  # fmt: skip
+
     def linked(self, links: Links, formation: Ints) -> None:
         """Nobody looks."""
 
@@ -368,6 +387,10 @@ class Sumo(Session):
         wrong = np.flatnonzero(np.abs(now.position - wanted) > TOLERANCE_M)
         if len(wrong):
             raise CouplingError("; ".join(self._explain(int(i), now, before, displacement) for i in wrong[:5]))
+        for i in self.returning:
+            if not self.api.vehicle.getLaneID(self.ids[i]):
+                raise CouplingError(f"train {self.ids[i]} is parked; SUMO does not let it back at {self._time():.3f} s")
+        self.returning.clear()
         if self.coming:
             trains = np.array([i for i, _ in self.coming])
             self._verify_insertion(trains, np.array([speed for _, speed in self.coming]))

@@ -124,7 +124,7 @@ OF_NO_EFFECT: Mapping[str, frozenset[str]] = {
     ),
     **dict.fromkeys(
         ("trainStop", "busStop", "containerStop", "chargingStation", "overheadWireSegment", "parkingArea"),
-        _words("name lines color personCapacity parkingLength group access angle width length roadsideCapacity onRoad",
+        _words("name lines color personCapacity parkingLength group access angle width length",
                "power efficiency chargeInTransit chargeDelay chargeType"),
     ),
 }  # fmt: skip
@@ -145,7 +145,7 @@ NAMED: Mapping[tuple[str, str], tuple[str, frozenset[str]] | Refused] = {
             "toTaz": ("trips between zones have no route here", frozenset()),
         }.items()
     },
-    ("stop", "parking"): ("a train that is to park stays on its track, and others wait for it", OFF),
+    ("stop", "parking"): ("the train stays on its track, and others wait for it", OFF | _words("true 1 yes on x t True")),
     ("stop", "triggered"): ("nobody boards; a train stands as long as duration and until say", OFF),
     ("stop", "containerTriggered"): ("nothing is loaded; a train stands as long as duration and until say", OFF),
     ("stop", "join"): Refused("trains are not joined; take the stop and the train that joins out of the files"),
@@ -156,6 +156,8 @@ NAMED: Mapping[tuple[str, str], tuple[str, frozenset[str]] | Refused] = {
     ("stop", "onDemand"): ("nobody waits or boards; the train stops", OFF),
     ("stop", "index"): ("stops are made in the order of the file", _words("end fit")),
     ("stop", "extension"): ("nobody is waited for", OFF),
+    ("parkingArea", "roadsideCapacity"): ("there is room for everybody", frozenset()),
+    ("parkingArea", "onRoad"): ("who stops there leaves the track", OFF),
     ("vType", "scale"): ("every train of it comes once", _words("1 1.0 1.00")),
     **{
         ("vType", key): ("train type and law of the scenario drive the train", frozenset[str]())

@@ -55,6 +55,7 @@ class Stop(NamedTuple):
     name: str  # of the train stop, or ""
     first: int  # number in the route of the earliest edge it may be on
     pass_mps: float  # it does not stand, but passes with at most this speed; 0: it stands
+    parks: bool  # it leaves the track meanwhile
 
 
 class Departure(NamedTuple):
@@ -264,6 +265,7 @@ def _departure(
             name=next((stop.get(tag, "") for tag in PLACES if stop.get(tag)), ""),
             first=at,
             pass_mps=float(stop.get("speed", "0")),
+            parks=stop.get("parking", "false").lower() in YES or stop.get("parkingArea") is not None,
         )
         for stop, place, at in zip(vehicle.iter("stop"), places, firsts, strict=True)
     ]
