@@ -14,11 +14,11 @@ from trainctl.diff.sources import sumo_log, sumo_logs_in
 ROOT = Path(__file__).parents[2]
 
 
-#: What SUMO 1.28 writes and its own schemas do not know; and, of routes, the attributes of types.
+#: What SUMO 1.28 writes and its own schemas do not know; and, of routes, the attributes of types and of vehicles.
 LATER = {
     "summary": {"discarded"},
     "statistics": set(),
-    "vehroute": {"length", "vClass", "maxSpeed", "accel", "decel", "speedFactor", "insertionChecks"},
+    "vehroute": {"length", "vClass", "maxSpeed", "accel", "decel", "speedFactor", "insertionChecks", "arrivalPos"},
 }
 
 

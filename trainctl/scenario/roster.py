@@ -232,7 +232,8 @@ def _stops(departure: Departure, rails: Rails, way: Ints, begin: Floats, begin_s
     normal = np.flatnonzero(~rails.internal[way])
     for stop in departure.stops:
         edge = rails.index[stop.edge]
-        row = max(row, int(normal[stop.first]))
+        if (lap := int(normal[stop.first])) > row:
+            row, last = lap, -math.inf
         row += int(way[row] == edge and stop.position_m < last)
         ahead = np.flatnonzero(way[row:] == edge)
         if not len(ahead):
