@@ -119,11 +119,32 @@ def test_any_start_within_its_conditions_runs(tmp_path: Path) -> None:
 def test_what_acted_is_said_when_it_diverges(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text(tomli_w.dumps(scenario("asymptotic", 80e3)))
     prepared = open_scenario(str(tmp_path / "s.toml"), {"run.duration_s": 100.0})
-    words = r"train 2 is no longer finite after 90 s: train 2 was held at standstill \(unit 1, 2, 3\)"
+    words = r"train 2, 3 is no longer finite after 90 s: train 2 was held at standstill \(unit 1, 2, 3\)"
     with pytest.raises(LawError, match=words), opened(prepared, tmp_path / "run", "numeric") as s:
         for _ in range(90):
             s.step()
         s.state.plant.estimate[prepared.heads[1], 2] = np.nan
         s.step()
     reason = json.loads((tmp_path / "run.partial" / "run.json").read_text())["failure"]["reason"]
-    assert "train 2 was held at standstill" in reason
+    assert "train 2 was held at standstill" in reason  # train 3 hears it
+
+
+def test_gains_may_differ_from_carriage_to_carriage(tmp_path: Path) -> None:
+    """Lists of equal numbers are that number; other numbers matter, and keep all bounds."""
+    plain = scenario("asymptotic")
+    plain["run"]["duration_s"] = 60.0
+    plain["train"][1]["position_m"] += 20.0
+    lists = {
+        "controller": {
+            "law": "fault_tolerant", "carriage_l1": [0.1] * 3, "carriage_l2": [0.1] * 9, "head_l1_per_s": [0.01] * 3, "head_l4": [1.0] * 3,
+        },
+        "observer": {"kind": "asymptotic", "pole_per_s": [-3.0] * 9, "fault_sinusoids": [[[1.0] * 3, 2e5]]},
+    }  # fmt: skip
+    other = {
+        "controller": {"law": "fault_tolerant", "carriage_l1": [0.1, 0.2, 0.3], "head_l1_per_s": [0.01, 0.012, 0.008]},
+        "observer": {"kind": "asymptotic", "pole_per_s": [-3.0, -2.5, -2.0], "fault_sinusoids": [[[1.0, 1.1, 1.2], 2e5]]},
+    }
+    one, same, differs = (done({**plain, **more}, tmp_path / str(k)) for k, more in enumerate(({}, lists, other)))
+    assert np.array_equal(one.units.position_m, same.units.position_m)
+    assert np.abs(one.units.position_m - differs.units.position_m).max() > 1e-3
+    assert not [event for event in differs.events if event["kind"] == "violation"]

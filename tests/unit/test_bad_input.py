@@ -142,6 +142,14 @@ CASES |= {
     "outside (39)": (
         FAULTY + "[[train]]\nid = 3\nposition_m = 4000.0\n", ["distance error -4948 m is not between -2351 and 1947 m", "condition (39)"],
     ),
+    "gains per carriage of the wrong length": (
+        FAULTY + "[controller]\ncarriage_l1 = [0.1, 0.2]\nhead_l4 = [1.0, 1.0]\n[observer]\npole_per_s = [-3.0, -3.0, -2.0, -3.0]\n",
+        [
+            "controller.carriage_l1 = [0.1, 0.2]: has 2 values, it takes one number, or a list of 3 (the carriages of a train) or 9",
+            "controller.head_l4 = [1, 1]: has 2 values, it takes one number, or a list of 3 (all trains)",
+            "observer.pole_per_s = [-3, -3, -2, -3]: has 4 values",
+        ],
+    ),
     "gains outside (38)": (
         FAULTY + "[controller]\nhead_l2 = 2.0\nhead_l3 = 4.0\nhead_l4 = 0.4\n",
         ["head_l2 = 2: must be above 2", "head_l3 = 4: must be above", "head_l4 = 0.4: must be above 1/2"],

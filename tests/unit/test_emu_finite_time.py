@@ -276,3 +276,39 @@ def test_rehearsal_ends_with_the_weights_the_couplers_reached() -> None:
         assert len(w) == n
         assert (w[0] > 3.0) == reached
         assert w[0] >= w[1] >= w[2] >= w[3] == 1.0
+
+
+MASSES = np.tile([9e4, 6e4, 8e4, 5e4], 3)
+
+
+def test_units_of_unequal_mass_are_refused_without_the_repair() -> None:
+    s = scene(mass=MASSES)
+    (first, *_) = law.violations(Params(), s)
+    assert "must be equally heavy" in first and "weighted_by_mass = true" in first
+    assert law.violations(Params(weighted_by_mass=True), s) == []
+
+
+def test_a_coupler_pulls_units_of_unequal_mass_with_one_force() -> None:
+    """The relative acceleration is that of equal units; no force is left over inside a train."""
+    equal, unequal = scene(), scene(mass=MASSES)
+    for s in (equal, unequal):
+        s.own[2:4, 0] -= 0.02  # the coupler behind unit 2 of train 1
+        s.own[8:, 1] += 0.0
+    forces = accelerations(unequal, Params(weighted_by_mass=True)) * MASSES
+    assert abs(forces[1] + forces[2]) < 1e-6 * abs(forces[1])
+    k = unequal.consists.stiffness[1]
+    pair = 2.0 / (1.0 / MASSES[1] + 1.0 / MASSES[2])
+    weight = 1.0 - k / pair / 20.0
+    assert forces[2] == pytest.approx(pair * weight * 20.0 * 0.02**0.9, rel=1e-9)
+    total = forces[2] + k * 0.02  # with the spring, which the term in k / p1 makes up for where alpha_1 = 1
+    assert total * (1.0 / MASSES[1] + 1.0 / MASSES[2]) == pytest.approx(
+        2.0 * (weight * 20.0 * 0.02**0.9 + k / pair * 0.02), rel=1e-9
+    )
+
+
+def test_heads_and_tails_pull_trains_of_equal_mass_alike() -> None:
+    """What two trains do to each other is one force where their mean masses are equal, whatever head and tail weigh."""
+    s = scene(positions=(10e3, 6600.0), mass=MASSES[:8])
+    s.own[4:, 1] += 1.0
+    slots, leader = accelerations(s, Params(weighted_by_mass=True, mu_1=1e-12, mu_2=1e-12)) * MASSES[:8], 7e4
+    assert slots[3] == pytest.approx(-slots[4], rel=1e-6) and abs(slots[3]) > 0.01 * leader
