@@ -191,7 +191,7 @@ CHANGED = {
     "points": ("pending", "messages.ever", "rule.track", "formed.formation", "messages.sent"),
     "formations, stops": (
         "claims", "came", "left", "next_stop", "stands_until", "stopping", "rule.slot", "ask_at", "parted", "refused",
-        "formed.ahead", "formed.led", "formed.offset", "pace.acceleration",
+        "formed.ahead", "formed.led", "formed.offset", "references.position",
     ),
     "single track": ("waits_for", "claims"),
 }  # fmt: skip
