@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -9,7 +10,7 @@ from trainctl.scenario.model import Prepared
 from trainctl.stages.record import Journal, Record
 
 
-class Steps:
+class Steps(ABC):
     """One run. ``state`` is where it stands: a named tuple with ``k``, the steps done, and ``watch``, what has been broken.
 
     Parameters
@@ -48,17 +49,17 @@ class Steps:
         if self.between is not None:
             self.between()
 
+    @abstractmethod
     def after(self, s: Any) -> Any:
         """The state a step later."""
-        raise NotImplementedError
 
+    @abstractmethod
     def end(self) -> None:
         """The last instant, which nothing acts on."""
-        raise NotImplementedError
 
+    @abstractmethod
     def outcome(self) -> dict[str, Any]:
         """What run.json says of the finished run."""
-        raise NotImplementedError
 
     def run(self, progress: Callable[[int, int], Any] | None = None) -> None:
         """All steps; ``progress(done, steps)`` is called about a hundred times."""

@@ -137,12 +137,17 @@ def speeds(drawn: Drawn) -> Figure:
     return figure
 
 
+def _draw_trains(panel: Axes, drawn: Drawn, column: str, drawstyle: str) -> None:
+    """Draw a column of every train over time into a panel."""
+    time, values = drawn.trains.column("time_s"), drawn.trains.column(column)
+    for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
+        style.draw(panel, time[rows], values[rows], label=label, drawstyle=drawstyle, **drawn.look[name])
+
+
 def draw_speeds(panel: Axes, drawn: Drawn) -> None:
     """Draw speeds, bounds and reference into a panel."""
-    time, speed = drawn.trains.column("time_s"), drawn.trains.column("speed_mps")
     style.bound(panel, *_distinct(drawn.known.speed_mps.values()))
-    for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
-        style.draw(panel, time[rows], speed[rows], label=label, **drawn.look[name])
+    _draw_trains(panel, drawn, "speed_mps", drawstyle="default")
     if drawn.known.reference is not None:
         instants = drawn.instants
         reference = leader(drawn.known.reference, instants)[1]
@@ -162,10 +167,8 @@ def inputs(drawn: Drawn) -> Figure:
 
 def draw_inputs(panel: Axes, drawn: Drawn) -> None:
     """Draw applied inputs, held until the next row, and bounds into a panel."""
-    time, applied = drawn.trains.column("time_s"), drawn.trains.column("input_mps2")
     style.bound(panel, *_distinct(drawn.known.input_mps2.values()))
-    for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
-        style.draw(panel, time[rows], applied[rows], label=label, drawstyle="steps-post", **drawn.look[name])
+    _draw_trains(panel, drawn, "input_mps2", drawstyle="steps-post")
     panel.set_ylabel(r"input [m/s$^2$]")
 
 
