@@ -64,6 +64,7 @@ CONTINUOUS = (
     "first_brakes",
     "full",
     "nan",
+    "inching",
 )
 
 Plants = tuple[tuple[str, bool, int], ...]
@@ -266,7 +267,8 @@ def drawn(seed: int, place: Path, plants: Plants = PLANTS) -> Case:
     tables = base(draw, seed, kind, continuous)
     where = net_case(draw, place, folder, tables, kind) if on_net else line_case(draw, folder, tables, kind, continuous)
     controller = tables["controller"]
-    controller["every_m"] = tables["reference"]["speed_mps"] * draw.uniform(8.0, 60.0)
+    every = tables["run"]["step_s"] if controller["style"] == "inching" else draw.uniform(8.0, 60.0)
+    controller["every_m"] = tables["reference"]["speed_mps"] * every
     style, law = controller["style"], Path(controller["law"])
     shutil.copy(law, folder)  # so that the folder stands for itself; runs here share what was compiled of the one module
     (folder / "s.toml").write_text(tomli_w.dumps(tables | {"controller": controller | {"law": law.name}}))

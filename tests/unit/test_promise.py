@@ -136,6 +136,12 @@ def test_what_cannot_be_kept_is_refused_with_the_number_that_would_do(tmp_path):
     assert "supervisor.uncertainty" in unit and "position_uncertainty_m or speed_uncertainty_mps" in unit
 
 
+def test_a_train_that_does_not_fit_its_plant_is_told_by_that_alone(tmp_path):
+    with pytest.raises(InputError) as refused:  # and not by a division by its actuators' rate of 0
+        open_scenario(scenario(tmp_path, trains=1, plant={"kind": "actuated_units"}))
+    assert refused.value.mistakes == ["s.toml: actuator_rate_per_s = 0: must be above 0 for train 1 in actuated_units"]
+
+
 def test_monitoring_refuses_nothing(tmp_path):
     open_scenario(scenario(tmp_path, speed=71.0, trains=1, supervisor={"mode": "monitor"}))
     open_scenario(scenario(tmp_path, speed=71.0, trains=1, supervisor={"mode": "off"}))

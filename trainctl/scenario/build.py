@@ -141,7 +141,7 @@ def prepare(
         found += placing.steep(prepared)
         if trains is None and not misplaced:
             prepared = replace(prepared, roster=roster.placed(scenario, network[0]))
-        if prepared.roster is not None:
+        if prepared.roster is not None and not unfit:  # else there are no numbers to rely on
             found += can_brake(prepared) or promise.refusals(prepared)
     if found:
         # What follows from a key that is wrong already is not a mistake of its own.

@@ -34,6 +34,9 @@ from trainctl.topology import exchange
 #: A law may move a train within a step by so much [m] per second more or less than a held acceleration would.
 WITHIN_M = 0.02
 
+#: Rounding in the way of a train that stands [m].
+CREEP_M = 1e-9
+
 
 class State(NamedTuple):
     """What a plant of units remembers; of point trains every array is empty."""
@@ -260,15 +263,23 @@ class Units:
         heads, full = self.p.heads, self.p.supervision.emergency_mps2
         v, after = own[heads, SPEED], moved[heads, SPEED]
         drives = mean + (self.swing(moved) - self.swing(own)) / self.step_s
-        if self.p.plant.STATES > FORCE:
-            drives += self.lag * (np.maximum(self.acceleration(moved), 0.0) - np.maximum(self.acceleration(own), 0.0)) / self.step_s
+        late = self.p.plant.STATES > FORCE
+        if late:
+            before, now = self.acceleration(own), self.acceleration(moved)
+            drives += self.lag * (np.maximum(now, 0.0) - np.maximum(before, 0.0)) / self.step_s
+            # What the supervisor takes for the speed, see its note 4; it changes evenly while an order is held.
+            v_late, after_late = (u + self.lag * np.maximum(a + full, 0.0) for u, a in ((v, before), (after, now)))
         else:
-            beyond = displacement - 0.5 * (v + after) * self.step_s
-            explained = mean + 2.0 * beyond / self.step_s**2
-            swings = (np.abs(beyond) > WITHIN_M * self.step_s) & ((explained > drives) | (explained < -full))
-            drives = np.where(swings, explained, drives)
+            v_late, after_late = v, after
+        beyond = displacement - 0.5 * (v_late + after_late) * self.step_s
+        explained = (after_late - v_late) / self.step_s + 2.0 * beyond / self.step_s**2
+        swings = (np.abs(beyond) > WITHIN_M * self.step_s) & ((explained > drives) | (not late) & (explained < -full))
+        # A step that begins and ends at a stand must not creep in between, however little: the next one could do so again.
+        creeps = (v <= 0.0) & (displacement > CREEP_M)
+        stops = np.where(creeps, displacement / self.step_s**2, mean)
+        stops = np.where(beyond > WITHIN_M * self.step_s, np.maximum(explained, stops), stops)
         hard = (v > 0.0) & (displacement < 0.5 * v**2 / full - WITHIN_M * self.step_s)
-        return np.where(after > 0.0, drives, np.where(hard, np.nan, mean))
+        return np.where(after > 0.0, np.where(swings, explained, drives), np.where(hard, np.nan, stops))
 
     def _climbing(self, own: Floats) -> Floats:
         """Weight along the track per mass [N/kg], (U,)."""
