@@ -25,8 +25,8 @@ from trainctl import runner
 from trainctl.errors import InputError, TrainctlError
 from trainctl.loop import Loop
 from trainctl.numeric import Numeric
-from trainctl.scenario.build import prepare
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.build import model_of
+from trainctl.scenario.model import Model
 from trainctl.scenario.reading import examine
 
 LAWS = Path(__file__).parent / "laws"
@@ -432,13 +432,13 @@ class Deaf:
         """One instant."""
 
 
-def opened(case: Case, mode: str) -> Prepared:
+def opened(case: Case, mode: str) -> Model:
     """The scenario, checked."""
     tables = case.tables | {"supervisor": case.tables["supervisor"] | {"mode": mode}}
     scenario, found = examine(tables)
     if scenario is None:
         raise InputError(found)
-    return prepare(scenario, "s.toml", case.folder, found)
+    return model_of(scenario, "s.toml", case.folder, found)
 
 
 def driven(case: Case, mode: str = "on", backend: str = "numeric") -> Outcome:

@@ -326,15 +326,15 @@ def inputs(folder: Path, case: str, trains: int, steps: int) -> None:
     from trainctl.stages.record import Journal
     from trainctl.sumo.session import LOGS, write_configuration, write_routes
 
-    prepared = open_scenario(str(folder / "scenario.toml"))
-    sumo_net.build(prepared.spec, folder)
+    model = open_scenario(str(folder / "scenario.toml"))
+    sumo_net.build(model.spec, folder)
 
     class Writer(Numeric):
         def start(self, start: Any) -> None:
             write_routes(start, folder / "trains.rou.xml")
 
-    Loop(prepared, Writer(prepared.line), Journal(folder, prepared))
-    configuration = write_configuration(folder, f"{prepared.spec.name}.net.xml", "trains.rou.xml", 1.0, steps + 1.0)
+    Loop(model, Writer(model.line), Journal(folder, model))
+    configuration = write_configuration(folder, f"{model.spec.name}.net.xml", "trains.rou.xml", 1.0, steps + 1.0)
     logs = [part for key, name in LOGS.items() for part in (f"--{key}", str(folder / name))]
     (folder / "command.json").write_text(json.dumps(["sumo", "-c", str(configuration), *logs]), encoding="utf-8")
     if case == "rail":
@@ -425,11 +425,11 @@ def closed(folder: Path, case: str) -> Case:
         from trainctl.controllers import emu_finite_time
 
         emu_finite_time.REHEARSAL_STEPS = 1  # the check of the start takes 10 ms per train, and is not what is measured
-    prepared = open_scenario(str(folder / "scenario.toml"))
+    model = open_scenario(str(folder / "scenario.toml"))
     clock = Clock()
-    journal = Journal(folder, prepared)
-    world: Any = open_world(prepared, folder, "sumo" if case in IN_SUMO else "numeric")
-    loop = Loop(prepared, world, journal)
+    journal = Journal(folder, model)
+    world: Any = open_world(model, folder, "sumo" if case in IN_SUMO else "numeric")
+    loop = Loop(model, world, journal)
     loop.step()  # compiles or loads what the kernels need
     clock.around(loop, "_measured", "read")
     clock.around(loop.topology, "step", "topology")
@@ -450,7 +450,7 @@ def closed(folder: Path, case: str) -> Case:
         world.close()
         journal.close()
 
-    return Case(len(prepared.scenario.ids), loop.step, close, clock)
+    return Case(len(model.scenario.ids), loop.step, close, clock)
 
 
 def public(folder: Path, case: str) -> Case:

@@ -135,7 +135,7 @@ class Plots:
         from trainctl.figures import trains as figures_trains
 
         with style.styled():
-            return sorted(catalogue.applicable(figures_trains.prepare(self._run, "double")))
+            return sorted(catalogue.applicable(figures_trains.drawable(self._run, "double")))
 
     def __getattr__(self, name: str) -> Callable[..., Figure]:
         from trainctl.figures import catalogue
@@ -198,13 +198,13 @@ class Simulation:
         out : Path, optional
             Run folder; default none, nothing stays.
         """
-        prepared = open_scenario(str(scenario), settings)
+        model = open_scenario(str(scenario), settings)
         with ExitStack() as stack:
             if out is None:
                 folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="trainctl."))) / "run"
             else:
                 folder = Path(out)
-            opened = runner.opened(prepared, folder, backend, force, ("trainctl.Simulation",))
+            opened = runner.opened(model, folder, backend, force, ("trainctl.Simulation",))
             simulation = stack.enter_context(opened)
             return cls(stack.pop_all(), simulation, Path(out) if out is not None else None)
 

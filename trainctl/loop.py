@@ -15,7 +15,7 @@ from trainctl.errors import LawError
 from trainctl.numeric import lay_out
 from trainctl.plants import disturbance
 from trainctl.railway.ways import under
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.scenario.tables import Event
 from trainctl.signals import POSITION, SPEED, Bools, Demand, Disturbed, Floats, Formed, Messages, Motion, Seen, Start
 from trainctl.stages import control, driver, orders, plant, protect, record, topology, traffic
@@ -51,7 +51,7 @@ class Loop(Steps):
 
     Parameters
     ----------
-    prepared : Prepared
+    model : Model
         The scenario as arrays.
     world : World
         SUMO, or the numeric stand-in.
@@ -61,11 +61,11 @@ class Loop(Steps):
 
     state: State
 
-    def __init__(self, prepared: Prepared, world: World, journal: record.Journal) -> None:
-        super().__init__(prepared, journal)
+    def __init__(self, model: Model, world: World, journal: record.Journal) -> None:
+        super().__init__(model, journal)
         self.world = world
-        p, run = prepared, prepared.scenario.run
-        self.disturbances = disturbance.prepare(p.scenario.disturbance, p.scenario.ids, run.step_s, run.seed, p.worst)
+        p, run = model, model.scenario.run
+        self.disturbances = disturbance.signals(p.scenario.disturbance, p.scenario.ids, run.step_s, run.seed, p.worst)
         self.orders, self.traffic = orders.Orders(p, journal), traffic.Traffic(p, journal)
         self.topology = topology.Topology(p, journal)
         self.control, self.driver, self.plant = control.Control(p), driver.of(p), plant.of(p)

@@ -12,7 +12,7 @@ import numpy as np
 
 from trainctl.railway import supervisor
 from trainctl.railway.ways import Ways
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import POWERS, Bools, Extremes, Floats, Ints, Links, Motion, Observed, Row
 from trainctl.stages import orders, record
 from trainctl.stages.effort import Effort
@@ -36,7 +36,7 @@ class Watched(Steps):
 
     Parameters
     ----------
-    prepared : Prepared
+    model : Model
         The scenario as arrays.
     world : SelfDriven
         What drives the trains.
@@ -46,9 +46,9 @@ class Watched(Steps):
 
     state: State
 
-    def __init__(self, prepared: Prepared, world: SelfDriven, journal: record.Journal) -> None:
-        super().__init__(prepared, journal)
-        p, self.world = prepared, world
+    def __init__(self, model: Model, world: SelfDriven, journal: record.Journal) -> None:
+        super().__init__(model, journal)
+        p, self.world = model, world
         # Nobody but the simulator protects these trains: their switches are locked within its braking distance.
         rate = p.law.braking_mps2(p.params)
         protected = supervisor.Params(mode="on", service_mps2=rate, emergency_mps2=rate)

@@ -178,7 +178,7 @@ def test_worst_case_of_a_scenario_attains_the_bound_with_measurement_noise_too()
         {**t, "shape": "worst_case", "pair": [1, 4], "peak_s": 1000.0}
         for t in [*PRINTED, {"on": "measurement", "amplitude_m": 0.5, "shape": "constant"}]
     ]
-    signals = disturbance.prepare(entries(tables), start.trains, T, None, partial(law.worst, PARAMS, start))
+    signals = disturbance.signals(entries(tables), start.trains, T, None, partial(law.worst, PARAMS, start))
     bound = law.analysis(PARAMS, start, entries(tables)).gain
     assert bound is not None
     assert bound.worst_pair == ("1", "4")
@@ -201,7 +201,7 @@ def random_signals(rng: np.random.Generator, copies: int) -> disturbance.Signals
             if shape in ("sine", "square"):
                 table |= {"period_s": float(10 ** rng.uniform(0.4, 3)), "phase_rad": float(rng.uniform(0, 6))}
             found.append(table)
-    return disturbance.prepare(entries(found), [str(i + 1) for i in range(N * copies)], T, int(rng.integers(2**32)))
+    return disturbance.signals(entries(found), [str(i + 1) for i in range(N * copies)], T, int(rng.integers(2**32)))
 
 
 def largest_error_over_bound(graph: str, copies: int, seed: int) -> tuple[float, float]:

@@ -251,7 +251,7 @@ def test_signals_that_cannot_stand_are_found_before_the_run(tmp_path: Path) -> N
 
 
 def test_what_sumo_would_not_feel_is_refused() -> None:
-    from trainctl.scenario.build import prepare
+    from trainctl.scenario.build import model_of
     from trainctl.scenario.reading import read
 
     data, path = read("fault_tolerant")
@@ -259,7 +259,7 @@ def test_what_sumo_would_not_feel_is_refused() -> None:
     checked, found = examine(data)
     assert checked is not None
     with pytest.raises(InputError, match="fault: SUMO's own trains take none"):
-        prepare(checked, path.name, path.parent, found)
+        model_of(checked, path.name, path.parent, found)
 
 
 def test_a_net_has_the_signals_it_has() -> None:

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from trainctl.cli.program import app
 from trainctl.laws import laws
-from trainctl.scenario.build import prepare
+from trainctl.scenario.build import model_of
 from trainctl.scenario.reading import examine, find, read
 from trainctl.studies.compare import PANELS, alternatives, figures, names, table
 
@@ -52,7 +52,7 @@ def test_every_law_can_be_put_in_front_of_three_tracks():
         ], name
         scenario, mistakes = examine(changed)
         assert mistakes == [], name
-        prepare(scenario, path.name, path.parent)
+        model_of(scenario, path.name, path.parent)
     assert found["ordinary_consensus"]["controller"]["alpha_1"] == 1.0
     assert found["sumo_moving_block"]["controller"] == {"law": "sumo", "block": "moving"}
     moving = {**data, "controller": {"law": "sumo", "block": "moving", "signals_m": 1000.0}}

@@ -24,7 +24,7 @@ def entry(**table: Any) -> d.Disturbance:
 
 
 def series(*tables: dict[str, Any], steps: int = 8, seed: int | None = 1, position: Floats = HERE) -> list[Disturbed]:
-    signals = d.prepare([entry(**t) for t in tables], IDS, T, seed)
+    signals = d.signals([entry(**t) for t in tables], IDS, T, seed)
     return [d.at(signals, k, k * T, position) for k in range(steps)]
 
 
@@ -91,7 +91,7 @@ def test_worst_case_takes_the_signs_of_the_law() -> None:
         return np.arange(5 * steps * 3).reshape(5, steps, 3) % 2 * 2.0 - 1.0
 
     e = entry(on="speed", train=[3, 1], shape="worst_case", amplitude_mps=[0.1, 0.2], pair=[1, 3], peak_s=2.0)
-    signals = d.prepare([e], IDS, T, None, worst)
+    signals = d.signals([e], IDS, T, None, worst)
     assert asked == [(0, 2, 4)]
     signs = worst(0, 2, 4)
     for k in range(6):
@@ -107,7 +107,7 @@ NOISE = {"on": "speed", "shape": "uniform", "amplitude_mps": 1.0}
 
 def noise(steps: int = 2000, ids: tuple[str, ...] = IDS, seed: int | None = 1, before: int = 0, **changes: Any) -> Floats:
     quiet = {"on": "speed", "shape": "constant", "amplitude_mps": 0.0}
-    signals = d.prepare([*[entry(**quiet)] * before, entry(**{**NOISE, **changes})], ids, T, seed)
+    signals = d.signals([*[entry(**quiet)] * before, entry(**{**NOISE, **changes})], ids, T, seed)
     return np.array([d.at(signals, k, k * T, np.zeros(len(ids))).speed for k in range(steps)])
 
 
@@ -133,7 +133,7 @@ def test_gaussian_is_cut_off_at_the_amplitude() -> None:
 
 def test_noise_depends_on_seed_entry_train_and_step_alone() -> None:
     u = noise(50)
-    signals = d.prepare([entry(**NOISE)], IDS, T, 1)
+    signals = d.signals([entry(**NOISE)], IDS, T, 1)
     np.testing.assert_array_equal(d.at(signals, 37, 37 * T, HERE).speed, u[37])  # a resumed run
     np.testing.assert_array_equal(noise(50, ids=("3", "7", "1"))[:, [2, 0]], u[:, [0, 2]])  # other trains, other order
     for other in (noise(50, seed=2), noise(50, seed=1 + 2**32), noise(50, before=1)):
@@ -143,7 +143,7 @@ def test_noise_depends_on_seed_entry_train_and_step_alone() -> None:
 def test_own_seed_makes_an_entry_independent_of_the_others() -> None:
     quiet = entry(on="speed", shape="constant", amplitude_mps=0.0)
     own = entry(**NOISE, seed=5)
-    alone, behind = d.prepare([own], IDS, T, 1), d.prepare([quiet, own], IDS, T, None)
+    alone, behind = d.signals([own], IDS, T, 1), d.signals([quiet, own], IDS, T, None)
     np.testing.assert_array_equal(d.at(alone, 3, 1.5, HERE).speed, d.at(behind, 3, 1.5, HERE).speed)
 
 

@@ -126,7 +126,7 @@ def checked(text: str, folder: Path) -> None:
     elif "scenario" in tomllib.loads(text):
         plan = sweep.ready_made(str(folder / name))
         assert plan is not None
-        sweep.prepared(sweep.jobs(plan)[0])
+        sweep.job_model(sweep.jobs(plan)[0])
     else:
         open_scenario(str(folder / name))
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from trainctl.errors import InputError
 from trainctl.figures import style
-from trainctl.figures.catalogue import FIGURES, applicable, comparison, figure, plot, prepare
+from trainctl.figures.catalogue import FIGURES, applicable, comparison, drawable, figure, plot
 from trainctl.laws import shipped
 from trainctl.plants.actuated_units import COLUMNS as UNIT_EXTRAS
 from trainctl.record.folder import about_run, write_info
@@ -109,16 +109,16 @@ def test_each_law_gets_its_papers_figures(tmp_path: Path, law: str, monkeypatch:
 def test_a_law_without_links_units_or_reference_still_has_figures(tmp_path: Path) -> None:
     run = made_up(tmp_path, "sumo", trains=1)
     (tmp_path / "scenario.toml").unlink()
-    assert set(applicable(prepare(run))) == {"train_graph", "positions", "speeds", "inputs"}
-    for name in applicable(prepare(run)):
+    assert set(applicable(drawable(run))) == {"train_graph", "positions", "speeds", "inputs"}
+    for name in applicable(drawable(run)):
         assert isinstance(figure(run, name, "single"), Figure)
 
 
 def test_the_comparisons_of_two_papers_have_their_numbers(tmp_path: Path) -> None:
     ordinary = made_up(tmp_path / "a", "emu_finite_time", units=2, controller={"law": "emu_finite_time", "alpha_1": 1.0})
-    assert applicable(prepare(ordinary))["unit_speeds"] == "fig7_ordinary_consensus_unit_speeds"
+    assert applicable(drawable(ordinary))["unit_speeds"] == "fig7_ordinary_consensus_unit_speeds"
     other = made_up(tmp_path / "b", "fault_tolerant", units=2, observer={"kind": "intermediate"})
-    assert applicable(prepare(other))["unit_differences"] == "fig9_intermediate_estimator_unit_differences"
+    assert applicable(drawable(other))["unit_differences"] == "fig9_intermediate_estimator_unit_differences"
     shown = comparison([ordinary, other], ["finite time", "ordinary"])
     assert [axes.get_title(loc="left") for axes in shown.axes] == ["finite time", "ordinary"]
 

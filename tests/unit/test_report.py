@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from trainctl.errors import InputError
-from trainctl.figures.trains import prepare
+from trainctl.figures.trains import drawable
 from trainctl.record.recorder import Recorder, standard_tables
 from trainctl.report.animation import animation, frames
 from trainctl.report.page import page, report
@@ -75,7 +75,7 @@ def test_frames_hold_every_event_and_the_instants_around_it():
 
 
 def test_trains_2_and_5_change_tracks_and_the_links_are_redrawn_at_1001(run):
-    film = animation(prepare(run))
+    film = animation(drawable(run))
     names, time = [t["name"] for t in film["trains"]], np.array(film["time"])
     lateral = unpacked(film["lateral"]).reshape(len(time), -1)
     assert film["tracks"] == ["2", "1", "3"]  # from left to right in the running direction
@@ -102,7 +102,7 @@ def test_verdict_says_what_broke_first_and_where(finished, text):
 
 
 def test_lost_messages_are_told_from_missing_links(finished):
-    film = animation(prepare(finished("fully_distributed_loss", "numeric", **{"run.duration_s": 60})))
+    film = animation(drawable(finished("fully_distributed_loss", "numeric", **{"run.duration_s": 60})))
     assert set(base64.b64decode(film["links"])) == {1, 2}
 
 
@@ -124,7 +124,7 @@ def made_up(folder, trains, steps, title="made up"):
 
 def test_a_million_rows_make_a_small_page(tmp_path):
     run = made_up(tmp_path / "run", 250, 4000)
-    assert sum(len(panel["traces"]) for panel in panels(prepare(run))) > 700
+    assert sum(len(panel["traces"]) for panel in panels(drawable(run))) > 700
     text = page(run)
     assert len(text) < 10e6
     (speeds,) = [panel for panel in data_of(text)["panels"] if panel["id"] == "speeds"]

@@ -14,7 +14,7 @@ from matplotlib.colors import to_hex
 from trainctl.cli import program as cli
 from trainctl.errors import InputError
 from trainctl.figures import catalogue
-from trainctl.figures.trains import MARKS, prepare
+from trainctl.figures.trains import MARKS, drawable
 from trainctl.report.animation import animation
 from trainctl.report.page import page
 from trainctl.runner import run
@@ -57,7 +57,7 @@ def test_no_line_where_a_train_is_not_there_and_marks_where_something_happened(m
     axes = catalogue.figure(merging, "train_graph").axes
     assert len(axes) == 1
     first = merging.trains.astype({"train": str}).groupby("train")["time_s"].min()
-    colour = {name: to_hex(c) for name, c in prepare(merging).colour.items()}
+    colour = {name: to_hex(c) for name, c in drawable(merging).colour.items()}
     marks = {mark: 0 for mark, _ in MARKS.values()}
     for line in axes[0].lines:
         if line.get_marker() in marks:
@@ -73,7 +73,7 @@ def test_no_line_where_a_train_is_not_there_and_marks_where_something_happened(m
 
 
 def test_the_page_shows_the_net_as_it_lies(merging):
-    film = animation(prepare(merging))
+    film = animation(drawable(merging))
     frames, trains = len(film["time"]), len(film["trains"])
     x, y, edge = (np.frombuffer(base64.b64decode(film[k]["bdata"]), "<f4") for k in ("position", "lateral", "edge"))
     x, y, edge = (v.reshape(frames, trains) for v in (x, y, edge))
@@ -87,7 +87,7 @@ def test_the_page_shows_the_net_as_it_lies(merging):
 
 
 def test_a_run_without_sumo_has_a_page_without_animation(numeric):
-    assert animation(prepare(numeric))["time"] == []
+    assert animation(drawable(numeric))["time"] == []
     text = page(numeric)
     assert "There is no animation: a run without SUMO" in text
     assert "<div hidden>" in text

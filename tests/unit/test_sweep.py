@@ -11,7 +11,7 @@ import pytest
 from trainctl.errors import InputError, LawError
 from trainctl.studies import sweep as sweeping
 from trainctl.studies.results import shares, wilson
-from trainctl.studies.sweep import Plan, half_width, jobs, prepared, seeds, sweep, values
+from trainctl.studies.sweep import Plan, half_width, job_model, jobs, seeds, sweep, values
 
 SHORT = {"run.duration_s": [20]}
 
@@ -92,7 +92,7 @@ def test_jitter_depends_on_seed_and_key_alone():
     def starts(seed, **jitter):
         plan = Plan("monte_carlo_start", {}, [seed], {f"train.{k}": w for k, w in jitter.items()})
         plan = Plan(str(sweeping.sweeps()["monte_carlo_start"]), plan.settings, plan.seeds, plan.jitter)
-        return prepared(jobs(plan)[0]).own
+        return job_model(jobs(plan)[0]).own
 
     rest, moved, both = starts(1), starts(1, position_m=500.0), starts(1, position_m=500.0, speed_mps=4.0)
     deviation = moved[:, 0] - rest[:, 0]
@@ -184,7 +184,7 @@ def test_the_ready_made_sweep_is_found_and_its_starts_are_sound():
     assert plan is not None
     assert len(plan.seeds) == 100
     for job in [j for j in jobs(plan) if j.parameters["topology.loss"] == 0.0]:
-        prepared(job)  # raises if a start condition fails
+        job_model(job)  # raises if a start condition fails
     assert sweeping.ready_made("fully_distributed") is None
 
 

@@ -94,7 +94,7 @@ def printed(k: int, position: Floats) -> Disturbed:
     return disturbance.at(SIGNALS, k, k * T, position)
 
 
-SIGNALS = disturbance.prepare(entries(PRINTED), ["1", "2", "3", "4"], T, None)
+SIGNALS = disturbance.signals(entries(PRINTED), ["1", "2", "3", "4"], T, None)
 
 
 class Loop:

@@ -64,7 +64,7 @@ class Drawn:
         return {name: {"color": self.colour[name], "linewidth": width} for name, width in zip(self.names, widths, strict=True)}
 
 
-def prepare(run: Run, width: str = "double") -> Drawn:
+def drawable(run: Run, width: str = "double") -> Drawn:
     """Sort the tables of a run into series."""
     return Drawn(run, facts(run), series(run.trains, "train"), pairs(run.links), series(run.units, "train", "unit"), width)
 
@@ -315,7 +315,7 @@ def gaps(drawn: Drawn) -> Figure:
 def comparison(runs: Sequence[Run], names: Sequence[str], width: str = "double") -> Figure:
     """Speeds of several runs, one panel each on a common scale: a law against ordinary consensus, with and without disturbance."""
     with style.styled():
-        drawn = [prepare(run, width) for run in runs]
+        drawn = [drawable(run, width) for run in runs]
         figure, axes = style.panels(len(drawn), width, sharey=True)
         for panel, one, name in zip(axes, drawn, names, strict=True):
             draw_speeds(panel, one)

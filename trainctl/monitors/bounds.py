@@ -21,7 +21,7 @@ from trainctl.signals import Floats, Ints
 
 if TYPE_CHECKING:
     from trainctl.railway.ways import Ways
-    from trainctl.scenario.model import Prepared
+    from trainctl.scenario.model import Model
     from trainctl.signals import Row, Seen
     from trainctl.stages.traffic import Around
     from trainctl.stages.traffic import State as Traffic
@@ -47,7 +47,7 @@ class State(NamedTuple):
 class Alarms:
     """Tells what is broken for the first time. Its methods update the ``State`` they are given."""
 
-    def __init__(self, p: Prepared) -> None:
+    def __init__(self, p: Model) -> None:
         self.p = p
         self.watch = on_track.of(p)
         self.waiting = Waiting(p.scenario.ids, p.line.edges, p.driving.wait_limit_s)

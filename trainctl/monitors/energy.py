@@ -10,7 +10,7 @@ import numpy as np
 from trainctl.signals import POSITION, SPEED, Floats, Row
 
 if TYPE_CHECKING:
-    from trainctl.scenario.model import Prepared
+    from trainctl.scenario.model import Model
     from trainctl.signals import Row
 
 #: Signs of ``signals.POWERS`` in the balance.
@@ -35,7 +35,7 @@ class Balance:
     #: Largest share of the turnover that may come from nowhere.
     LIMIT = 1e-3
 
-    def __init__(self, p: Prepared) -> None:
+    def __init__(self, p: Model) -> None:
         c = p.consists
         self.heads, self.units = c.first[:-1], np.diff(c.first)
         self.inertia, self.stiffness, self.length = c.mass * c.rotating, c.stiffness.copy(), c.length

@@ -19,7 +19,7 @@ from trainctl.railway.ways import Ways
 from trainctl.signals import Bools, Floats, Ints
 
 if TYPE_CHECKING:
-    from trainctl.scenario.model import Prepared
+    from trainctl.scenario.model import Model
     from trainctl.signals import Seen
 
 keep_by_sources()  # before anything below is decorated
@@ -122,7 +122,7 @@ class Watch:
             }  # fmt: skip
 
 
-def of(p: Prepared) -> Watch:
+def of(p: Model) -> Watch:
     """The watch over the trains of a scenario."""
     return Watch(p.scenario.ids, p.consists.train_length(), p.roster.speed_factor, p.rails, p.line, not p.placed)
 

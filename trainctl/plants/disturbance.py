@@ -243,7 +243,7 @@ def violations(entries: Sequence[Disturbance], trains: Sequence[str], seed: int 
     return found
 
 
-def prepare(
+def signals(
     entries: Sequence[Disturbance], trains: Sequence[str], step: float, seed: int | None, worst: Worst | None = None
 ) -> Signals:
     """Arrays of all disturbances of a run.
@@ -313,7 +313,7 @@ def at(signals: Signals, k: int, t: float, position: Floats) -> Disturbed:
     Parameters
     ----------
     signals : Signals
-        From ``prepare``.
+        From ``signals``.
     k : int
         Number of the step, 0 for the first of the run.
     t : float

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from trainctl.errors import InputError
-from trainctl.figures.trains import Drawn, prepare
+from trainctl.figures.trains import Drawn, drawable
 from trainctl.metrics.run import DEFINITIONS, SLACK, metrics
 from trainctl.record.folder import plain
 from trainctl.report.animation import animation
@@ -74,7 +74,7 @@ def page(run: Run) -> str:
     """The whole page as text."""
     from plotly.offline import get_plotlyjs
 
-    drawn = prepare(run)
+    drawn = drawable(run)
     if not drawn.trains.names:
         raise InputError(f"{run.folder}: no train was recorded")
     values = run.metrics if (run.folder / "metrics.json").exists() else metrics(run)

@@ -9,14 +9,14 @@ import numpy as np
 
 from trainctl.plants import shared
 from trainctl.scenario import limits, promise
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.topology import graph
 
 #: More trains than this are counted, not named.
 MOST = 40
 
 
-def facts(p: Prepared) -> dict[str, Any]:
+def facts(p: Model) -> dict[str, Any]:
     """Facts by name, ``warnings`` and the law's ``report`` (both lists of lines)."""
     run, scene = p.scenario.run, p.first_scene
     links = graph.edges(scene.links, p.scenario.ids)
@@ -60,7 +60,7 @@ def facts(p: Prepared) -> dict[str, Any]:
     return found
 
 
-def _traffic(p: Prepared) -> dict[str, Any]:
+def _traffic(p: Model) -> dict[str, Any]:
     """Facts of trains that come and go, and of their net."""
     rails, roster, rules = p.roster.rails, p.roster, p.supervision
     normal = ~rails.internal

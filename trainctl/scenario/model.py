@@ -38,7 +38,7 @@ from trainctl.topology.exchange import Radio
 
 
 @dataclass(frozen=True)
-class Prepared:
+class Model:
     """A scenario as arrays, and the modules it names. ``spec`` is the line's description, or None if it came as a net."""
 
     scenario: Scenario
@@ -255,7 +255,7 @@ class Prepared:
 BAND_MPS = 0.05
 
 
-def speed_band(p: Prepared) -> tuple[float, float]:
+def speed_band(p: Model) -> tuple[float, float]:
     """Least and greatest speed of a reference with which the law takes one train of each kind as a formation [m/s]."""
     spacing = p.spacing
     cruise = float(p.scenario.reference.speed_mps or 0.0)

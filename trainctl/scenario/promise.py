@@ -24,7 +24,7 @@ from trainctl.railway.ways import ways
 from trainctl.signals import GRAVITY, POSITION, SPEED, Floats
 
 if TYPE_CHECKING:
-    from trainctl.scenario.model import Prepared
+    from trainctl.scenario.model import Model
 
 #: What has no bound is counted as this many standard deviations: exceeded once in 5e8 draws.
 DEVIATIONS = 6.0
@@ -50,7 +50,7 @@ class Parts(NamedTuple):
     lag: Floats  # s
 
 
-def top_speed(p: Prepared) -> Floats:
+def top_speed(p: Model) -> Floats:
     """Highest speed the line allows every train anywhere on its route, or that it starts with [m/s], shape (n,)."""
     start = p.own[p.heads, SPEED]
     if p.placed:
@@ -63,7 +63,7 @@ def top_speed(p: Prepared) -> Floats:
     return found
 
 
-def _slopes(p: Prepared) -> tuple[Floats, Floats]:
+def _slopes(p: Model) -> tuple[Floats, Floats]:
     """Steepest descent and ascent of every train's route, rise / run >= 0, shape (n,)."""
     if p.placed:
         breaks, slope = p.line.gradient.breaks, p.line.gradient.slope
@@ -78,7 +78,7 @@ def _slopes(p: Prepared) -> tuple[Floats, Floats]:
     return down, up
 
 
-def parts(p: Prepared) -> Parts:
+def parts(p: Model) -> Parts:
     """Numbers behind ``assume``, for every train of a scenario."""
     n, c, run, b = len(p.scenario.ids), p.consists, p.scenario.run, p.supervision.emergency_mps2
     top, (down, up) = top_speed(p), _slopes(p)
@@ -102,7 +102,7 @@ def _scatter(found: Parts) -> Floats:
     return found.input + found.speed + found.resistance + found.noise
 
 
-def assume(p: Prepared) -> Assumed:
+def assume(p: Model) -> Assumed:
     """What the supervisor relies on of every train of a scenario; ``refusals`` says where that cannot be met."""
     found, rules, c = parts(p), p.supervision, p.consists
     scatter = _scatter(found)
@@ -133,7 +133,7 @@ def planned(assumed: Assumed, rate: float) -> Assumed:
     return assumed._replace(braking=braking, hardest=ahead, uncertainty=3.0 * assumed.uncertainty)
 
 
-def refusals(p: Prepared) -> list[str]:
+def refusals(p: Model) -> list[str]:
     """What of the promise cannot be kept in a scenario with ``mode = "on"``, with the numbers that would do."""
     if p.supervision.mode != "on" or p.self_driven:
         return []
@@ -146,7 +146,7 @@ def refusals(p: Prepared) -> list[str]:
     return _weak(p) or _lost(p)
 
 
-def _weak(p: Prepared) -> list[str]:
+def _weak(p: Model) -> list[str]:
     """Trains that cannot be relied on to brake."""
     found, assumed, b = parts(p), p.assumed, p.supervision.emergency_mps2
     surely = np.minimum(found.given, b) - assumed.scatter
@@ -172,7 +172,7 @@ def _weak(p: Prepared) -> list[str]:
     return []
 
 
-def _why(p: Prepared, found: Parts, i: int) -> str:
+def _why(p: Model, found: Parts, i: int) -> str:
     """What leaves train ``i`` so little braking."""
     b = p.supervision.emergency_mps2
     told = [f"full braking {b:g} m/s2"]
@@ -196,7 +196,7 @@ _DISTURBED = {
 }
 
 
-def _lost(p: Prepared) -> list[str]:
+def _lost(p: Model) -> list[str]:
     """Starts from which a collision or an overspeed cannot be averted. Trains that come later enter only where it is safe."""
     if not p.placed:
         return []
@@ -232,7 +232,7 @@ def _lost(p: Prepared) -> list[str]:
     return found
 
 
-def told(p: Prepared) -> dict[str, Any]:
+def told(p: Model) -> dict[str, Any]:
     """The promise and what it assumes, in numbers: for `check`, run.json and the report."""
     rules, found, assumed = p.supervision, parts(p), p.assumed
     i = int(np.argmin(assumed.braking))
@@ -258,7 +258,7 @@ def told(p: Prepared) -> dict[str, Any]:
     }
 
 
-def _unbounded(p: Prepared) -> bool:
+def _unbounded(p: Model) -> bool:
     """Whether anything random has no bound, so that the promise holds with a probability only."""
     noisy = p.plant.noise_hold(p.plant_params) is not None
     return noisy or any(not np.isfinite(entry.greatest(p.scenario.ids)).all() for entry in p.scenario.disturbance)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from trainctl.errors import LawError
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import POSITION, SPEED, Demand, Disturbed, Floats, Formed, Messages, Trains
 from trainctl.topology import exchange
 
@@ -16,7 +16,7 @@ from trainctl.topology import exchange
 class Control:
     """Sampled laws; continuous ones are evaluated inside the plant's step."""
 
-    def __init__(self, p: Prepared) -> None:
+    def __init__(self, p: Model) -> None:
         self.p = p
         self.radio = p.radio
         self.clamps = getattr(p.law, "CLAMPED", False) and not p.plant.CLAMPS  # else the plant does

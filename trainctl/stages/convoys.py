@@ -13,7 +13,7 @@ import numpy as np
 from trainctl.railway import along
 from trainctl.railway.authority import View
 from trainctl.railway.supervisor import SWITCH
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import POSITION, SPEED, Bools, Floats, Formed, Ints, Links, Pace, Reference, Seen, restrict
 from trainctl.stages.record import Journal
 from trainctl.stages.traffic import SOON_S, Around
@@ -44,7 +44,7 @@ class Convoys:
 
     CHECKS = False  # the law was asked before trains coupled
 
-    def __init__(self, p: Prepared, journal: Journal) -> None:
+    def __init__(self, p: Model, journal: Journal) -> None:
         self.p, self.journal, self.roster = p, journal, p.roster
         self.n, self.step_s, self.spacing = len(p.scenario.ids), p.scenario.run.step_s, p.spacing
         self.least = p.band[0]

@@ -9,7 +9,7 @@ import numpy as np
 from trainctl.railway import authority, supervisor
 from trainctl.railway.authority import View
 from trainctl.railway.supervisor import STOP
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import Bools, Floats, Formed
 from trainctl.stages.traffic import Around
 from trainctl.stages.traffic import State as Traffic
@@ -35,7 +35,7 @@ class Driven(NamedTuple):
     stands: Bools  # (n,) the train is held where it is
 
 
-def of(p: Prepared) -> Nobody | Driver:
+def of(p: Model) -> Nobody | Driver:
     """The driver of a scenario's trains."""
     return Driver(p) if p.driven else Nobody()
 
@@ -53,7 +53,7 @@ class Nobody:
 class Driver:
     """Drives whoever no law does."""
 
-    def __init__(self, p: Prepared) -> None:
+    def __init__(self, p: Model) -> None:
         self.p, self.n = p, len(p.scenario.ids)
         self.step_s, self.theta = p.scenario.run.step_s, p.step_theta
         self.rules, self.assumed = p.driver_rules, p.relied_on_by_driver

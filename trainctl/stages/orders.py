@@ -15,7 +15,7 @@ from sumo_net.line import LineCrossover
 from trainctl.errors import InputError
 from trainctl.railway import supervisor
 from trainctl.railway.ways import Ways
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.scenario.tables import Event
 from trainctl.signals import Floats, Ints, Seen
 from trainctl.stages.record import Journal
@@ -32,7 +32,7 @@ class LeadsNowhere(Refused):
 class Orders:
     """Orders of a run. Those of the scenario are numbered from 1 by their tables; more may be added from outside."""
 
-    def __init__(self, p: Prepared, journal: Journal) -> None:
+    def __init__(self, p: Model, journal: Journal) -> None:
         self.p, self.journal = p, journal
         self.known: list[Event] = list(p.scenario.event)
         self.length = p.consists.train_length()

@@ -10,7 +10,7 @@ import numpy as np
 
 from trainctl.davis import resistance
 from trainctl.plants import coupled_units, faults, integrate, point, shared
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import (
     FORCE,
     GRAVITY,
@@ -59,12 +59,12 @@ class Moved(NamedTuple):
     state: State
 
 
-def of(p: Prepared) -> Points | Units:
+def of(p: Model) -> Points | Units:
     """The plant of a scenario."""
     return Units(p) if p.plant.UNITS else Points(p)
 
 
-def _slopes(p: Prepared) -> Floats:
+def _slopes(p: Model) -> Floats:
     """Where the line's slopes begin [m] and their rise / run, shape (G, 2); (0, 2) on a level line."""
     slopes = np.column_stack([p.line.gradient.breaks, p.line.gradient.slope])
     return slopes if slopes[:, 1].any() else np.zeros((0, 2))
@@ -73,7 +73,7 @@ def _slopes(p: Prepared) -> Floats:
 class Points:
     """Point trains under a sampled law."""
 
-    def __init__(self, p: Prepared) -> None:
+    def __init__(self, p: Model) -> None:
         self.step_s = p.scenario.run.step_s
         self.noisy = p.plant.noise_hold(p.plant_params) is not None
         self.plant = cast(PointPlant, p.plant)
@@ -132,7 +132,7 @@ class Points:
 class Units:
     """Trains of units, integrated jointly with observer and law; a sampled law's acceleration is shared out to them."""
 
-    def __init__(self, p: Prepared) -> None:
+    def __init__(self, p: Model) -> None:
         self.p = p
         run, top = p.scenario.run, p.scenario.topology
         self.step_s, self.sub_steps = run.step_s, run.sub_steps

@@ -10,7 +10,7 @@ import numpy as np
 from trainctl.railway import authority, supervisor
 from trainctl.railway.authority import View
 from trainctl.railway.supervisor import KINDS, applied
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import SPEED, Bools, Disturbed, Floats
 from trainctl.stages import plant
 from trainctl.stages.driver import Driven
@@ -23,7 +23,7 @@ OverTheStep = Callable[[Floats, Disturbed, plant.State, bool], plant.Moved]
 class Protect:
     """The supervisor of a run: bounds accelerations, and tells when it begins and ends to do so."""
 
-    def __init__(self, p: Prepared, journal: Journal, disturbing: bool) -> None:
+    def __init__(self, p: Model, journal: Journal, disturbing: bool) -> None:
         self.p, self.rules, self.journal = p, p.supervision, journal
         self.disturbing = disturbing
 

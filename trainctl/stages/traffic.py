@@ -12,7 +12,7 @@ from trainctl.railway import along, authority, interlocking, supervisor
 from trainctl.railway.authority import DRIVER_MARGIN_M, View
 from trainctl.railway.interlocking import Held
 from trainctl.railway.ways import Ways
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.scenario.roster import Stop
 from trainctl.signals import Bools, Floats, Ints, Seen
 from trainctl.stages.record import Journal
@@ -69,7 +69,7 @@ def nothing(trains: int) -> Around:
 class Traffic:
     """The traffic of a run."""
 
-    def __init__(self, p: Prepared, journal: Journal) -> None:
+    def __init__(self, p: Model, journal: Journal) -> None:
         self.p, self.journal, self.roster = p, journal, p.roster
         self.rules, self.assumed = p.driver_rules, p.relied_on_by_driver
         self.step_s, self.theta = p.scenario.run.step_s, p.step_theta

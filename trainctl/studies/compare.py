@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from trainctl.errors import InputError
 from trainctl.figures import style
-from trainctl.figures.trains import Drawn, draw_inputs, draw_speeds, prepare
+from trainctl.figures.trains import Drawn, draw_inputs, draw_speeds, drawable
 from trainctl.laws import compared, find_plant, plants_of
 from trainctl.metrics.run import DEFINITIONS, metrics
 from trainctl.metrics.values import Values
@@ -66,7 +66,7 @@ def figures(runs: Sequence[Run], labels: Sequence[str], out: Path, formats: Sequ
     out.mkdir(parents=True, exist_ok=True)
     written = []
     with style.styled():
-        drawn = [prepare(run) for run in runs]
+        drawn = [drawable(run) for run in runs]
         if not any(one.trains.names for one in drawn):
             raise InputError("compare: no train was recorded in any of the runs")
         for name, paint in PANELS.items():

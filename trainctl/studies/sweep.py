@@ -189,7 +189,7 @@ def jobs(plan: Plan, keep: Path | None = None) -> list[Job]:
             raise InputError([f"{file.name}: {line}" for line in wrong])
     for job in found[:20]:  # one combination that can run is enough: others may be what the sweep is to find out
         try:
-            prepared(job._replace(jitter={}))
+            job_model(job._replace(jitter={}))
         except InputError as error:
             refused = refused or error.mistakes
         else:
@@ -203,16 +203,16 @@ def jobs(plan: Plan, keep: Path | None = None) -> list[Job]:
     return found
 
 
-def prepared(job: Job) -> Any:
+def job_model(job: Job) -> Any:
     """The run's scenario as arrays, its starts moved by the jitter."""
-    from trainctl.scenario.build import prepare
+    from trainctl.scenario.build import model_of
 
     tables = {**job.tables, "train": [dict(train) for train in job.tables.get("train", [])]}
     _move(tables, job.jitter)
     scenario, found = examine(tables)
     if scenario is None:
         raise InputError([f"{job.file}: {line}" for line in found])
-    return prepare(scenario, job.file, Path(job.folder), found)
+    return model_of(scenario, job.file, Path(job.folder), found)
 
 
 def _move(tables: dict[str, Any], jitter: Mapping[str, float]) -> None:
@@ -253,7 +253,7 @@ def _outcome(job: Job, folder: Path) -> dict[str, Any]:
     from trainctl import runner
     from trainctl.record.folder import plain
 
-    p = prepared(job)
+    p = job_model(job)
     done = runner.run(p, folder, job.backend, job.keep is not None)  # type: ignore[arg-type]
     values = {key: value for key, value in done.metrics.items() if "/" not in key and isinstance(value, int | float)}
     told = {key: done.info[key] for key in COUNTS}

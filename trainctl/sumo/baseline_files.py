@@ -10,7 +10,7 @@ import numpy as np
 
 from sumo_net.netfile import content
 from trainctl.errors import InputError
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import SPEED, Floats
 from trainctl.sumo.session import OPTIONS, fcd_period, normal
 
@@ -41,7 +41,7 @@ class Departure(NamedTuple):
     arrival_m: float = np.inf  # where on the last edge it leaves; inf: at its end
 
 
-def verify_signals(p: Prepared) -> None:
+def verify_signals(p: Model) -> None:
     """Whether a net that came as a file has the signals that fixed block needs.
 
     Raises
@@ -54,7 +54,7 @@ def verify_signals(p: Prepared) -> None:
         raise InputError(f"{p.file}: controller.block = fixed: {p.net.name} {rule}")
 
 
-def departures(p: Prepared) -> list[Departure]:
+def departures(p: Model) -> list[Departure]:
     """The trains of a scenario, one each.
 
     Raises
@@ -78,7 +78,7 @@ def departures(p: Prepared) -> list[Departure]:
     return found
 
 
-def _top_speeds(p: Prepared) -> Floats:
+def _top_speeds(p: Model) -> Floats:
     """Greatest speed of every train [m/s], shape (n,)."""
     if p.params.top_speed_mps is not None:
         return np.full(len(p.scenario.ids), p.params.top_speed_mps)
@@ -87,7 +87,7 @@ def _top_speeds(p: Prepared) -> Floats:
     return np.where(np.isfinite(p.bounds.speed_upper), p.bounds.speed_upper, wanted)
 
 
-def _coming(p: Prepared) -> list[Departure]:
+def _coming(p: Model) -> list[Departure]:
     """The trains of a SUMO configuration, as its files have them."""
     roster, rails = p.roster, p.rails
     found = []
@@ -110,7 +110,7 @@ def _coming(p: Prepared) -> list[Departure]:
     return found
 
 
-def write_routes(p: Prepared, trains: list[Departure], path: Path) -> None:
+def write_routes(p: Model, trains: list[Departure], path: Path) -> None:
     """The trains as SUMO vehicles: true lengths, no randomness, driven by the ``Rail`` model."""
     lengths = np.maximum(p.consists.train_length(), 1.0).tolist()  # SUMO has no points
     keys = [(d.vclass, length, d.top_speed, d.speed_factor) for d, length in zip(trains, lengths, strict=True)]
@@ -146,7 +146,7 @@ def _words(attributes: dict[str, str | None]) -> str:
     return "".join(f" {key}={quoteattr(value)}" for key, value in attributes.items() if value is not None)
 
 
-def write_configuration(p: Prepared, net: str, folder: Path) -> Path:
+def write_configuration(p: Model, net: str, folder: Path) -> Path:
     """``run.sumocfg``: what SUMO's own programs run without us. Insertion follows SUMO's rules."""
     internal = any(edge.startswith(":") for edge in p.line.edges)
     options = {
