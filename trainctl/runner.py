@@ -27,7 +27,7 @@ from trainctl.numeric import Numeric
 from trainctl.record import checkpoint
 from trainctl.record.folder import (
     about_run,
-    claim,
+    open_partial,
     finish,
     held,
     ours,
@@ -133,7 +133,7 @@ def _opened(
         raise InputError(f"--checkpoint-every {every:g}: must be a multiple of step_s = {step:g}")
     if every is not None and gui is not None:
         raise InputError("--checkpoint-every: a run that is watched cannot be resumed; leave out --gui")
-    partial = claim(out, force)
+    partial = open_partial(out, force)
     with held(partial):
         text = p.scenario.toml()
         protection = {"protection": promise.told(p)} if p.supervision.mode != "off" and not p.self_driven else {}

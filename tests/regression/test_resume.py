@@ -148,7 +148,7 @@ def test_every_law_resumes_from_any_step(name, settings, tmp_path):
     ],
 )
 def test_runs_of_a_configuration_resume_from_any_step(net, law, backend, duration, tmp_path):
-    """Trains that have come, left, stopped, coupled, claimed switches and taken another way; the configuration itself is gone."""
+    """Trains that have come, left, stopped, coupled, requested switches and taken another way; the configuration itself is gone."""
     place = tmp_path / "configuration"
     place.mkdir()
     if net == "single_track":

@@ -17,7 +17,7 @@ from trainctl.loop import Loop
 from trainctl.numeric import Numeric
 from trainctl.record import checkpoint
 from trainctl.record.checkpoint import Saved, Tape, leaves, plain
-from trainctl.record.folder import claim, free, held, ours, remove, write_info
+from trainctl.record.folder import open_partial, free, held, ours, remove, write_info
 from trainctl.runner import again, begin
 from trainctl.scenario.build import open_scenario
 from trainctl.signals import Demand, Start
@@ -190,10 +190,10 @@ CHANGED = {
     "actuators": ("plant.sent_at", "plant.counted", "plant.heard", "plant.estimate", "messages.sent"),
     "points": ("pending", "messages.ever", "rule.track", "formed.formation", "messages.sent"),
     "formations, stops": (
-        "claims", "came", "left", "next_stop", "stands_until", "stopping", "rule.slot", "ask_at", "parted", "refused",
+        "requests", "came", "left", "next_stop", "stands_until", "stopping", "rule.slot", "ask_at", "parted", "refused",
         "formed.ahead", "formed.led", "formed.offset", "references.position",
     ),
-    "single track": ("waits_for", "claims"),
+    "single track": ("waits_for", "requests"),
 }  # fmt: skip
 
 
@@ -270,7 +270,7 @@ def test_a_folder_knows_its_scenario_and_network(own_line, tmp_path):
         path.write_bytes(sumo_net.shipped()["three_tracks"].read_bytes())
         settings["network.line"] = str(path)
     prepared = open_scenario("three_tracks", settings)
-    partial = claim(tmp_path / "run")
+    partial = open_partial(tmp_path / "run")
     (partial / "scenario.toml").write_text(prepared.scenario.toml())
     begin(partial, prepared, 2.0)
     if own_line:
@@ -293,10 +293,10 @@ def test_other_sources_are_another_identity(monkeypatch, tmp_path):
 
 
 def test_a_run_killed_at_its_first_word_is_no_obstacle(tmp_path):
-    partial = claim(tmp_path / "run")
+    partial = open_partial(tmp_path / "run")
     (partial / "run.json.new").write_text("{")
     assert free(partial)
-    assert claim(tmp_path / "run") == partial
+    assert open_partial(tmp_path / "run") == partial
     (partial / "thesis.tex").write_text("x")
     assert not free(partial)
 

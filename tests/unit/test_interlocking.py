@@ -54,7 +54,7 @@ class Yard:
         zones = interlocking.zones(ways, along.net(self.net))
         before = json.dumps(self.state)
         arrays = (row, s, self.length, self.present)
-        self.state, held, said = interlocking.claim(zones, self.state, *arrays, self.reach, self.clearance, **more)
+        self.state, held, said = interlocking.request(zones, self.state, *arrays, self.reach, self.clearance, **more)
         assert json.loads(json.dumps(self.state)) == json.loads(json.dumps(self.state)) and before is not None
         self.state = json.loads(json.dumps(self.state))  # as a checkpoint keeps it
         return held, said
@@ -138,7 +138,7 @@ def test_turns_at_a_join_stay_and_those_of_one_track_keep_the_order_they_stand_i
     held, said = yard.now()
     assert np.isinf(held.room).all()  # turns hold nobody
     assert [(d.train, d.granted, d.by) for d in said] == [(0, True, -1), (1, False, 0)]
-    yard.put(2, "a", 960)  # stands before 0 but claims later
+    yard.put(2, "a", 960)  # stands before 0 but requests later
     yard.put(1, "b", 950)  # overtakes 0 by distance, but not its turn
     yard.now()
     m = str(MERGE.number["m"])
@@ -223,7 +223,7 @@ def drive(net_of, routes, seed, n, limit=9000):
             if min(rest, default=np.inf) > length[i] + 20.0:
                 present[i], s[i] = True, length[i]
         reach = v**2 / (2 * BRAKING) + 3 * v + 2 * MARGIN
-        state, held, _ = interlocking.claim(zones, state, row, s, length, present, reach, 2 * MARGIN)
+        state, held, _ = interlocking.request(zones, state, row, s, length, present, reach, 2 * MARGIN)
         here = along.places(ways, net, row, s, length, present, 3000.0, interlocking.order(state))
         room = np.minimum(bodies.obstacles(here, virtual=False).room, held.room) - MARGIN
         wanted = np.minimum(v + acceleration, top)

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from trainctl.errors import InputError
-from trainctl.record.folder import about_run, claim, finish, partial_of, write_info
+from trainctl.record.folder import about_run, open_partial, finish, partial_of, write_info
 from trainctl.record.recorder import Recorder, standard_tables
 from trainctl.runs.run import Run
 
@@ -162,7 +162,7 @@ def test_wrong_columns_are_refused(tmp_path: Path) -> None:
 
 
 def finished(folder: Path, text: str) -> None:
-    partial = claim(folder)
+    partial = open_partial(folder)
     write_info(partial, about_run("", 1, ["trainctl"]))
     (partial / "note").write_text(text)
     finish(folder)
@@ -171,7 +171,7 @@ def finished(folder: Path, text: str) -> None:
 def test_a_finished_run_of_ours_is_replaced_only_at_the_end(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     finished(folder, "old")
-    partial = claim(folder)
+    partial = open_partial(folder)
     assert partial == partial_of(folder)
     assert not any(partial.iterdir())
     assert (folder / "note").read_text() == "old"
@@ -184,12 +184,12 @@ def test_a_finished_run_of_ours_is_replaced_only_at_the_end(tmp_path: Path) -> N
 def test_anything_else_is_refused_unless_forced(tmp_path: Path) -> None:
     folder = tmp_path / "thesis"
     folder.mkdir()
-    claim(folder)  # empty: fine
+    open_partial(folder)  # empty: fine
     (folder / "chapter.tex").write_text("x")
     with pytest.raises(InputError, match="not a run of trainctl"):
-        claim(folder)
+        open_partial(folder)
     assert (folder / "chapter.tex").exists()
-    partial = claim(folder, force=True)
+    partial = open_partial(folder, force=True)
     assert (folder / "chapter.tex").exists()
     write_info(partial, about_run("", 1, []))
     finish(folder)
@@ -200,17 +200,17 @@ def test_the_current_directory_is_never_replaced(tmp_path: Path, monkeypatch: py
     monkeypatch.chdir(tmp_path)
     for place in (tmp_path, tmp_path.parent, Path("/")):
         with pytest.raises(InputError, match="current directory"):
-            claim(place, force=True)
+            open_partial(place, force=True)
 
 
 def test_a_foreign_partial_and_an_unwritable_place_are_refused(tmp_path: Path) -> None:
     (tmp_path / "run.partial").mkdir()
     (tmp_path / "run.partial" / "mine").write_text("x")
     with pytest.raises(InputError, match=r"run\.partial: exists"):
-        claim(tmp_path / "run")
+        open_partial(tmp_path / "run")
     (tmp_path / "file").write_text("x")
     with pytest.raises(InputError, match="cannot be written"):
-        claim(tmp_path / "file" / "run")
+        open_partial(tmp_path / "file" / "run")
 
 
 def read_all(folder: Path) -> tuple[object, ...]:

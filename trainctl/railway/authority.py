@@ -31,7 +31,7 @@ class View(NamedTuple):
     limits: Limits
     room: Floats  # (n,) m, to the body on the own way that surely is there; inf: none
     body: Ints  # (n,) whose it is, -1: none
-    fouling: Bools  # (n,) its tail lies on another train behind the beginning of its way, see ``topology.bodies``
+    fouling: Bools  # (n,) its tail lies on another train behind the beginning of its way, see ``railway.bodies``
 
 
 def look(
@@ -57,7 +57,7 @@ def look(
     held : ndarray, shape (n,)
         How far every front may go because what comes then is another train's turn [m]; inf: as far as it likes.
     order : Order, optional
-        Turns that are decided, see ``topology.claims``.
+        Turns that are decided, see ``interlocking.order``.
 
     Returns
     -------

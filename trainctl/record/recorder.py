@@ -3,7 +3,7 @@
 In short::
 
     info = about_run(scenario_text, seed, sys.argv)
-    partial = claim(out)                                     # DIR.partial, or InputError
+    partial = open_partial(out)                                     # DIR.partial, or InputError
     write_info(partial, info)
     with Recorder(partial, standard_tables(trains, tracks, edges)) as recorder:
         recorder.write("trains", time_s=t, train=codes, position_m=x, ...)   # every step

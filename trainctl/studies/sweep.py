@@ -310,7 +310,7 @@ def sweep(
     """
     todo = jobs(plan, Path(os.path.abspath(out)) / "runs" if keep else None)
     identity = _identity(plan, todo[0])
-    rows = _claim(out, identity, resume, force)
+    rows = _open_folder(out, identity, resume, force)
     known = {_key(job.parameters) for job in todo}
     rows = {key: row for key, row in rows.items() if key in known and row["status"] != "failed"}
     info = _about(identity, plan, todo, command_line)
@@ -441,7 +441,7 @@ def _write_info(out: Path, info: Mapping[str, Any]) -> None:
     write_json(out / INFO, info)
 
 
-def _claim(out: Path, identity: Mapping[str, Any], resume: bool, force: bool) -> dict[str, dict[str, Any]]:
+def _open_folder(out: Path, identity: Mapping[str, Any], resume: bool, force: bool) -> dict[str, dict[str, Any]]:
     """Make the folder ready; rows that are there already, by their parameters."""
     from trainctl.record.folder import free, remove
 
