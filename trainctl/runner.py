@@ -27,9 +27,9 @@ from trainctl.numeric import Numeric
 from trainctl.record import checkpoint
 from trainctl.record.folder import (
     about_run,
-    open_partial,
     finish,
     held,
+    open_partial,
     ours,
     partial_of,
     plain,

@@ -102,7 +102,7 @@ def test_headways_are_those_of_sumo_without_us(tmp_path: Path, block: str, signa
 @pytest.mark.campaign
 @pytest.mark.parametrize("block", ["fixed", "moving"])
 def test_the_rows_of_the_capacity_table_are_those_of_sumo_without_us(tmp_path: Path, block: str) -> None:
-    plan, row = capacity.Plan(), f"{block}_block"
+    plan, row = capacity.CapacityPlan(), f"{block}_block"
     capacity.prepare_files(plan, tmp_path, [row])
     ours = capacity.one(tmp_path / f"{row}.toml", tmp_path / row, plan)
     net = tmp_path / row / "sumo" / "capacity.net.xml"

@@ -17,7 +17,7 @@ from trainctl.scenario.build import open_scenario
 from trainctl.stages.driver import Driven, Driver
 from trainctl.stages.traffic import Traffic
 from trainctl.studies.results import write_results
-from trainctl.studies.sweep import Plan, jobs, simulate
+from trainctl.studies.sweep import SweepPlan, jobs, simulate
 from trainctl.sumo.session import collisions
 
 #: A law that never does anything.
@@ -174,7 +174,7 @@ def test_the_baseline_fails_too(tmp_path, typed):
 
 def test_in_a_sweep_a_collision_is_a_result(tmp_path):
     path = line(tmp_path / "s", RAMS)
-    found = [simulate(job) for job in jobs(Plan(str(path), {"run.duration_s": [20, 50]}, [], {}, "numeric"))]
+    found = [simulate(job) for job in jobs(SweepPlan(str(path), {"run.duration_s": [20, 50]}, [], {}, "numeric"))]
     assert [(row["status"], row["collisions"], row["gridlocks"]) for row in found] == [("complete", 0, 0), ("complete", 1, 0)]
     frame = write_results(found, tmp_path / "results.parquet")
     assert frame["collisions"].tolist() == pd.read_parquet(tmp_path / "results.parquet")["collisions"].tolist() == [0, 1]

@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 from trainctl.cli.program import app
 from trainctl.errors import InputError
 from trainctl.studies import capacity
-from trainctl.studies.capacity import Plan
+from trainctl.studies.capacity import CapacityPlan
 
-SMALL = Plan(trains=3, length_m=5000.0)
+SMALL = CapacityPlan(trains=3, length_m=5000.0)
 
 
 def made_up(*, headway: float = 40.0, speed: float = 80.0, entry: float | None = None, gap: float = 3000.0) -> pd.DataFrame:
@@ -71,7 +71,7 @@ def test_where_no_train_arrives_nothing_is_claimed():
     assert [row[key] for key in ("headway_s", "trains_per_hour", "journey_time_s", "energy_kwh_per_train_km")] == [None] * 4
 
 
-def as_they_should(rows: dict[str, dict[str, Any]], plan: Plan) -> None:
+def as_they_should(rows: dict[str, dict[str, Any]], plan: CapacityPlan) -> None:
     """Every train arrives, none too fast or too close; headways follow from blocks and spacings."""
     assert all(row["error"] is None and row["trains"] == plan.trains and row["collisions"] == 0 for row in rows.values())
     assert all(row["speed_max_mps"] <= plan.speed_mps + 1e-6 and row["least_gap_m"] > 0.0 for row in rows.values())
@@ -104,7 +104,7 @@ def test_the_whole_table(tmp_path: Path):
     assert done.exit_code == 0, done.stderr
     rows = {row["row"]: row for row in json.loads(done.stdout)}
     assert tuple(rows) == capacity.ROWS
-    as_they_should(rows, Plan())
+    as_they_should(rows, CapacityPlan())
     for name, row in rows.items():
         print(name, {key: row[key] if row[key] is None else round(row[key], 3) for key in capacity.MEASURED})
 
@@ -134,7 +134,7 @@ def test_a_row_that_fails_is_told_and_the_others_stand(tmp_path: Path, monkeypat
 )
 def test_what_makes_no_line_is_one_line(tmp_path: Path, plan: dict[str, float], line: str):
     with pytest.raises(InputError) as caught:
-        capacity.compare(Plan(**plan), tmp_path)  # type: ignore[arg-type]
+        capacity.compare(CapacityPlan(**plan), tmp_path)  # type: ignore[arg-type]
     assert any(mistake.startswith(line) for mistake in caught.value.mistakes), caught.value.mistakes
 
 

@@ -17,7 +17,7 @@ from trainctl.loop import Loop
 from trainctl.numeric import Numeric
 from trainctl.record import checkpoint
 from trainctl.record.checkpoint import Saved, Tape, leaves, plain
-from trainctl.record.folder import open_partial, free, held, ours, remove, write_info
+from trainctl.record.folder import free, held, open_partial, ours, remove, write_info
 from trainctl.runner import again, begin
 from trainctl.scenario.build import open_scenario
 from trainctl.signals import Demand, Start

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from trainctl.errors import InputError
-from trainctl.record.folder import about_run, open_partial, finish, partial_of, write_info
+from trainctl.record.folder import about_run, finish, open_partial, partial_of, write_info
 from trainctl.record.recorder import Recorder, standard_tables
 from trainctl.runs.run import Run
 

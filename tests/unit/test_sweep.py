@@ -11,7 +11,7 @@ import pytest
 from trainctl.errors import InputError, LawError
 from trainctl.studies import sweep as sweeping
 from trainctl.studies.results import shares, wilson
-from trainctl.studies.sweep import Plan, half_width, job_model, jobs, seeds, sweep, values
+from trainctl.studies.sweep import SweepPlan, half_width, job_model, jobs, seeds, sweep, values
 
 SHORT = {"run.duration_s": [20]}
 
@@ -58,7 +58,7 @@ def test_jitter_needs_a_key_of_trains_and_a_width():
 
 
 def test_every_setting_meets_every_other_and_every_seed():
-    plan = Plan("fully_distributed", {"topology.loss": [0.0, 0.1], "run.duration_s": [10, 20]}, [1, 2, 3], {})
+    plan = SweepPlan("fully_distributed", {"topology.loss": [0.0, 0.1], "run.duration_s": [10, 20]}, [1, 2, 3], {})
     found = plan.combinations()
     assert len(found) == 12
     assert len({json.dumps(c) for c in found}) == 12
@@ -68,12 +68,12 @@ def test_every_setting_meets_every_other_and_every_seed():
 @pytest.mark.parametrize(
     ("plan", "words"),
     [
-        (Plan("fully_distributed", {"topology.los": [0]}, [0], {}), "topology.los: unknown key; did you mean loss"),
-        (Plan("fully_distributed", {"controller.etta": ["printed"]}, [0], {}), "controller.etta: unknown key"),
-        (Plan("fully_distributed", {"topology.loss": [0.0, 2.0]}, [0], {}), "topology.loss = 2.0"),
-        (Plan("fully_distributed", {}, [], {"train.position_m": 1.0}), "needs --seeds"),
-        (Plan("fully_distributed", {}, [0], {"train.speed_upper_mps": 1.0}), "not every"),
-        (Plan("no_such", {}, [0], {}), "no such scenario"),
+        (SweepPlan("fully_distributed", {"topology.los": [0]}, [0], {}), "topology.los: unknown key; did you mean loss"),
+        (SweepPlan("fully_distributed", {"controller.etta": ["printed"]}, [0], {}), "controller.etta: unknown key"),
+        (SweepPlan("fully_distributed", {"topology.loss": [0.0, 2.0]}, [0], {}), "topology.loss = 2.0"),
+        (SweepPlan("fully_distributed", {}, [], {"train.position_m": 1.0}), "needs --seeds"),
+        (SweepPlan("fully_distributed", {}, [0], {"train.speed_upper_mps": 1.0}), "not every"),
+        (SweepPlan("no_such", {}, [0], {}), "no such scenario"),
     ],
 )
 def test_mistakes_are_told_before_anything_runs(plan, words):
@@ -82,16 +82,16 @@ def test_mistakes_are_told_before_anything_runs(plan, words):
 
 
 def test_one_start_that_is_refused_does_not_stop_the_others():
-    plan = Plan("fully_distributed", {"bounds.speed_upper_mps": [70.0, 85.0]}, [], {})
+    plan = SweepPlan("fully_distributed", {"bounds.speed_upper_mps": [70.0, 85.0]}, [], {})
     assert len(jobs(plan)) == 2
     with pytest.raises(InputError, match=r"speed bounds 75 \.\. 70 are empty"):
-        jobs(Plan("fully_distributed", {"bounds.speed_upper_mps": [70.0]}, [], {}))
+        jobs(SweepPlan("fully_distributed", {"bounds.speed_upper_mps": [70.0]}, [], {}))
 
 
 def test_jitter_depends_on_seed_and_key_alone():
     def starts(seed, **jitter):
-        plan = Plan("monte_carlo_start", {}, [seed], {f"train.{k}": w for k, w in jitter.items()})
-        plan = Plan(str(sweeping.sweeps()["monte_carlo_start"]), plan.settings, plan.seeds, plan.jitter)
+        plan = SweepPlan("monte_carlo_start", {}, [seed], {f"train.{k}": w for k, w in jitter.items()})
+        plan = SweepPlan(str(sweeping.sweeps()["monte_carlo_start"]), plan.settings, plan.seeds, plan.jitter)
         return job_model(jobs(plan)[0]).own
 
     rest, moved, both = starts(1), starts(1, position_m=500.0), starts(1, position_m=500.0, speed_mps=4.0)
@@ -117,7 +117,7 @@ def test_wilson_interval_against_published_numbers():
 
 
 def test_rows_come_in_the_order_of_the_plan_whoever_was_first(alone, tmp_path):
-    plan = Plan("fully_distributed", {**SHORT, "topology.loss": [0.0, 0.2]}, [0, 1], {}, "numeric")
+    plan = SweepPlan("fully_distributed", {**SHORT, "topology.loss": [0.0, 0.2]}, [0, 1], {}, "numeric")
     info = sweep(plan, tmp_path / "a")
     assert (info["status"], info["complete"], info["failed"], info["refused"]) == ("complete", 4, 0, 0)
     table = pd.read_parquet(tmp_path / "a" / "results.parquet")
@@ -140,7 +140,7 @@ def test_one_failure_is_recorded_and_the_rest_goes_on(alone, tmp_path, monkeypat
         return whole(p, folder, *more)
 
     monkeypatch.setattr(runner, "run", fails_once)
-    plan = Plan("fully_distributed", SHORT, [0, 1, 2], {}, "numeric")
+    plan = SweepPlan("fully_distributed", SHORT, [0, 1, 2], {}, "numeric")
     info = sweep(plan, tmp_path / "a")
     assert (info["complete"], info["failed"]) == (2, 1)
     assert info["reasons"] == ["run 1 failed: diverged in 000001"]  # no scratch folder in the dataset
@@ -154,7 +154,7 @@ def test_one_failure_is_recorded_and_the_rest_goes_on(alone, tmp_path, monkeypat
 
 
 def test_resume_skips_what_is_done_and_survives_a_cut_line(alone, tmp_path):
-    plan = Plan("fully_distributed", SHORT, [0, 1, 2], {}, "numeric")
+    plan = SweepPlan("fully_distributed", SHORT, [0, 1, 2], {}, "numeric")
     out = tmp_path / "a"
     sweep(plan, out)
     whole = (out / "results.parquet").read_bytes()
@@ -167,15 +167,15 @@ def test_resume_skips_what_is_done_and_survives_a_cut_line(alone, tmp_path):
 
 def test_resume_refuses_another_sweep_and_nothing_is_replaced_unasked(alone, tmp_path):
     out = tmp_path / "a"
-    sweep(Plan("fully_distributed", SHORT, [0], {}, "numeric"), out)
+    sweep(SweepPlan("fully_distributed", SHORT, [0], {}, "numeric"), out)
     with pytest.raises(InputError, match="--resume: its scenario"):
-        sweep(Plan("fully_distributed_loss", SHORT, [0], {}, "numeric"), out, resume=True)
+        sweep(SweepPlan("fully_distributed_loss", SHORT, [0], {}, "numeric"), out, resume=True)
     with pytest.raises(InputError, match="--force replaces it"):
-        sweep(Plan("fully_distributed", SHORT, [0], {}, "numeric"), out)
+        sweep(SweepPlan("fully_distributed", SHORT, [0], {}, "numeric"), out)
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "thesis.tex").touch()
     with pytest.raises(InputError, match="not a sweep"):
-        sweep(Plan("fully_distributed", SHORT, [0], {}, "numeric"), tmp_path / "b", resume=True)
+        sweep(SweepPlan("fully_distributed", SHORT, [0], {}, "numeric"), tmp_path / "b", resume=True)
     assert (tmp_path / "b" / "thesis.tex").exists()
 
 
@@ -189,7 +189,7 @@ def test_the_ready_made_sweep_is_found_and_its_starts_are_sound():
 
 
 def test_shares_are_told_per_combination(alone, tmp_path):
-    plan = Plan("fully_distributed", {**SHORT, "bounds.speed_upper_mps": [85.0, 85.5]}, [0, 1], {}, "numeric")
+    plan = SweepPlan("fully_distributed", {**SHORT, "bounds.speed_upper_mps": [85.0, 85.5]}, [0, 1], {}, "numeric")
     sweep(plan, tmp_path / "a")
     rows = shares(tmp_path / "a", ["bounds.speed_upper_mps"])
     assert [(r["values"], r["runs"], r["of"]) for r in rows] == [((85.0,), 0, 2), ((85.5,), 0, 2)]

@@ -17,7 +17,7 @@ from trainctl.errors import InputError
 from trainctl.scenario.tables import TrainType
 from trainctl.scenario.train_types import train_type
 from trainctl.traffic.kinds import Kind
-from trainctl.traffic.read import Traffic, read_traffic
+from trainctl.traffic.read import Configuration, read_traffic
 
 NODES = """<nodes><node id="a" x="0" y="0"/><node id="b" x="2000" y="0"/><node id="c" x="4000" y="0"/><node id="d" x="7000" y="0"/>
 <node id="x" x="500" y="600"/><node id="z" x="500" y="900"/></nodes>"""

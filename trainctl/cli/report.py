@@ -128,7 +128,7 @@ def _capacity(given: dict[str, Any], out: Path, formats: tuple[str, ...], worker
     from trainctl.cli.console import Progress, listing, show, show_json
     from trainctl.studies import capacity
 
-    plan = capacity.Plan(**given)
+    plan = capacity.CapacityPlan(**given)
     with Progress("capacity", sys.stderr.isatty()) as advance:
         table = capacity.compare(plan, out, workers=workers, progress=advance)
     pictures = capacity.figure(table, plan, out / "capacity", formats)

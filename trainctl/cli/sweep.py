@@ -11,7 +11,7 @@ import typer
 from trainctl.errors import InputError
 
 if TYPE_CHECKING:
-    from trainctl.studies.sweep import Plan
+    from trainctl.studies.sweep import SweepPlan
 
 
 def register(app: typer.Typer) -> None:
@@ -73,16 +73,16 @@ def register(app: typer.Typer) -> None:
             raise typer.Exit(1)
 
 
-def _plan(name: str, settings: list[str] | None, seeds: str | None, jitter: list[str] | None, backend: str) -> Plan:
+def _plan(name: str, settings: list[str] | None, seeds: str | None, jitter: list[str] | None, backend: str) -> SweepPlan:
     """What the command line asks for, laid over a ready-made sweep."""
     from trainctl.studies import sweep as sweeping
 
-    made = sweeping.ready_made(name) or sweeping.Plan(name, {}, [], {})
+    made = sweeping.ready_made(name) or sweeping.SweepPlan(name, {}, [], {})
     axes = {**made.settings, **dict(map(sweeping.values, settings or []))}
     if seeds is not None:
         axes.pop("run.seed", None)
     wanted = sweeping.seeds(seeds) if seeds is not None else made.seeds
-    return sweeping.Plan(made.scenario, axes, wanted, {**made.jitter, **dict(map(sweeping.half_width, jitter or []))}, backend)
+    return sweeping.SweepPlan(made.scenario, axes, wanted, {**made.jitter, **dict(map(sweeping.half_width, jitter or []))}, backend)
 
 
 class _Progress:

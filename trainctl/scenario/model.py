@@ -17,7 +17,7 @@ from trainctl.plants import disturbance
 from trainctl.railway import supervisor
 from trainctl.railway.authority import DRIVER_MARGIN_M
 from trainctl.scenario import limits, promise
-from trainctl.scenario.tables import Scenario, Traffic
+from trainctl.scenario.tables import Scenario, TrafficTable
 from trainctl.signals import (
     POSITION,
     SPEED,
@@ -152,9 +152,9 @@ class Model:
         return self.plant.lead(1)
 
     @cached_property
-    def driving(self) -> Traffic:
+    def driving(self) -> TrafficTable:
         """How trains that come and go are driven."""
-        return self.scenario.traffic or Traffic()
+        return self.scenario.traffic or TrafficTable()
 
     @cached_property
     def driver_rules(self) -> supervisor.Params:

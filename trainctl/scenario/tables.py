@@ -35,7 +35,7 @@ Id = Annotated[str, BeforeValidator(_name, json_schema_input_type=int | str)]
 PerUnit = float | tuple[float, ...]
 
 
-class Run(Table):
+class RunTable(Table):
     """[run]: time."""
 
     duration_s: Positive = Field(description="Length of the run [s].")
@@ -53,7 +53,7 @@ class Run(Table):
     seed: int | None = Field(None, ge=0, description="Seed of everything random; required as soon as something is.")
 
     @model_validator(mode="after")
-    def _multiples(self) -> Run:
+    def _multiples(self) -> RunTable:
         for key in ("duration_s", "control_period_s", "record_every_s"):
             value = getattr(self, key)
             steps = min(value / self.step_s, MOST_STEPS) if value is not None else 0.0
@@ -100,7 +100,7 @@ class Network(Table):
         return self
 
 
-class Traffic(Table):
+class TrafficTable(Table):
     """[traffic]: how trains of a SUMO configuration are driven outside of formations, and when they form one."""
 
     def below(self, limit: Floats) -> Floats:
@@ -335,7 +335,7 @@ class Scenario(Table):
 
     schema_version: Literal[1] = Field(description="Version of this format.")
     title: str = Field(description="One line: what the run shows.")
-    run: Run
+    run: RunTable
     network: Network
     controller: Controller
     observer: Observer = Observer()
@@ -344,7 +344,7 @@ class Scenario(Table):
     bounds: BoundsTable = BoundsTable()
     topology: Topology = Topology()
     supervisor: Supervisor | None = Field(None, description="Protection; default: off, on with network.sumocfg.")
-    traffic: Traffic | None = Field(None, description="Only with network.sumocfg.")
+    traffic: TrafficTable | None = Field(None, description="Only with network.sumocfg.")
     train_type: dict[str, TrainType] = Field({}, description="With network.sumocfg: by the ids of its vTypes.")
     train: tuple[Train, ...] = ()
     link: tuple[Link, ...] = ()

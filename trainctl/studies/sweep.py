@@ -38,7 +38,7 @@ ONE_SIMULATION = threading.Lock()
 
 
 @dataclass(frozen=True)
-class Plan:
+class SweepPlan:
     """What to run: every combination of ``settings`` with every seed.
 
     ``jitter`` maps keys of ``[[train]]`` to the half width of a uniform deviation, drawn for every train from the run's seed.
@@ -126,7 +126,7 @@ def sweeps() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
-def ready_made(name: str) -> Plan | None:
+def ready_made(name: str) -> SweepPlan | None:
     """The plan in a sweep file, given by path or as the name of a shipped one; None if ``name`` is a scenario."""
     path = Path(name)
     if path.suffix != ".toml":
@@ -148,12 +148,12 @@ def ready_made(name: str) -> Plan | None:
         jitter = dict(half_width(f"{k}={v}") for k, v in data.get("jitter", {}).items())
         beside = path.parent / str(data["scenario"])
         scenario = str(beside) if beside.suffix == ".toml" and beside.is_file() else str(data["scenario"])
-        return Plan(scenario, settings, seeds(str(data["seeds"])) if "seeds" in data else [], jitter)
+        return SweepPlan(scenario, settings, seeds(str(data["seeds"])) if "seeds" in data else [], jitter)
     except (InputError, AttributeError) as error:
         raise InputError(f"{path.name}: {error}") from None
 
 
-def jobs(plan: Plan, keep: Path | None = None) -> list[Job]:
+def jobs(plan: SweepPlan, keep: Path | None = None) -> list[Job]:
     """All runs of a plan, checked as far as that is the same for all of them.
 
     Raises
@@ -264,7 +264,7 @@ def _outcome(job: Job, folder: Path) -> dict[str, Any]:
 
 
 def sweep(
-    plan: Plan,
+    plan: SweepPlan,
     out: Path,
     *,
     workers: int | None = None,
@@ -279,7 +279,7 @@ def sweep(
 
     Parameters
     ----------
-    plan : Plan
+    plan : SweepPlan
         What to run.
     out : Path
         Folder of the sweep.
@@ -417,14 +417,14 @@ def _key(parameters: Mapping[str, Any]) -> str:
     return json.dumps(parameters, sort_keys=True, default=str)
 
 
-def _identity(plan: Plan, first: Job) -> dict[str, Any]:
+def _identity(plan: SweepPlan, first: Job) -> dict[str, Any]:
     """What must be the same for rows to belong to one dataset."""
     tables, _ = read(plan.scenario)
     digest = hashlib.sha256(json.dumps(tables, sort_keys=True, default=str).encode()).hexdigest()
     return {"scenario": first.file, "scenario_sha256": digest, "jitter": dict(plan.jitter), "backend": plan.backend}
 
 
-def _about(identity: Mapping[str, Any], plan: Plan, todo: Sequence[Job], command_line: Sequence[str]) -> dict[str, Any]:
+def _about(identity: Mapping[str, Any], plan: SweepPlan, todo: Sequence[Job], command_line: Sequence[str]) -> dict[str, Any]:
     from trainctl.record.folder import SCHEMA_VERSION, installed
 
     return {
