@@ -32,7 +32,7 @@ class Tracks(NamedTuple):
     time: np.ndarray  # (K,) s
     along: np.ndarray  # (K, n) m, front, from the beginning of the train's way
     speed: np.ndarray  # (K, n) m/s, of the front
-    least: np.ndarray  # (K, n) m/s, of the slowest unit
+    minimum: np.ndarray  # (K, n) m/s, of the slowest unit
     present: np.ndarray  # (K, n)
     ways: list[np.ndarray]  # edges of every train's way
 
@@ -57,8 +57,8 @@ class Recording:
         seen, ways = sim.world.measure(), sim.world.ways
         own, heads = sim.state.own, self.p.heads
         along = seen.position - ways.begin[ways.first[:-1]]
-        least = np.minimum.reduceat(own[:, 1], heads)
-        self.rows.append((sim.time, along, own[heads, 1].copy(), least, seen.present.copy()))
+        minimum = np.minimum.reduceat(own[:, 1], heads)
+        self.rows.append((sim.time, along, own[heads, 1].copy(), minimum, seen.present.copy()))
         self.ways = [ways.edge[a:b].copy() for a, b in zip(ways.first[:-1], ways.first[1:], strict=True)]
 
     def tracks(self) -> Tracks:
@@ -164,7 +164,7 @@ def crossed(
 
 
 def overspeed(p: Model, tracks: Tracks) -> str | None:
-    """The greatest excess over the limit of any edge under a train."""
+    """The maximum excess over the limit of any edge under a train."""
     worst = (OVERSPEED_MPS, "")
     for i, way in enumerate(tracks.ways):
         begins = np.concatenate([[0.0], np.cumsum(p.rails.length_m[way])])
@@ -185,7 +185,7 @@ def backwards(p: Model, tracks: Tracks) -> str | None:
     for what, broken, value in (
         ("place", (np.diff(tracks.along, axis=0) < -BACKWARDS) & there, np.diff(tracks.along, axis=0)),
         ("speed", (tracks.speed < -BACKWARDS) & tracks.present, tracks.speed),
-        ("unit", (tracks.least < -1e-3) & tracks.present, tracks.least),
+        ("unit", (tracks.minimum < -1e-3) & tracks.present, tracks.minimum),
     ):
         if broken.any():
             k, i = (int(x) for x in np.argwhere(broken)[0])

@@ -331,10 +331,10 @@ class Reliance(NamedTuple):
     """What protection may rely on of every train, shape (n,)."""
 
     braking: Floats  # m/s2, what brakes, faults and slope leave of the braking that is ordered
-    pull: Floats  # m/s2, greatest force per mass at the greatest speed; inf if there is no limit
+    pull: Floats  # m/s2, maximum force per mass at the maximum speed; inf if there is no limit
     bias: Floats  # m/s2, what faulty actuators add to the input
     late: Floats  # m/s2, how much running resistance may fall until actuators have followed
-    noise: Floats  # m/s2, greatest of the plant's own
+    noise: Floats  # m/s2, maximum of the plant's own
     lag: Floats  # s, of actuators
 
 
@@ -360,7 +360,7 @@ class Plant(Protocol):
         """Time for which a sample of the plant's own noise is held [s]; None: it has none, and needs no seed."""
 
     def room(self, consists: Consists, lower: Floats, upper: Floats) -> tuple[Floats, Floats]:
-        """Least and greatest input [m/s2], (n,) each, every train can give in the speed band ``lower`` to ``upper`` (n,)."""
+        """Minimum and maximum input [m/s2], (n,) each, every train can give in the speed band ``lower`` to ``upper`` (n,)."""
 
     def sure_braking(self, params: Any, consists: Consists, top: Floats) -> Floats:
         """Deceleration [m/s2], (n,), every train can give on the level at any speed up to ``top`` (n,); inf if unlimited."""

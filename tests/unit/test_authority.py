@@ -34,10 +34,10 @@ def judged(one: Targets, other: Targets) -> supervisor.Verdict:
 
 def test_the_better_of_following_and_of_keeping_the_join_clear_holds():
     follows, waits = (supervisor.verdict(PARAMS, SPEED, t, SLOW, 1.0, 0.5) for t in (FOLLOW, CLEAR))
-    assert follows.greatest[0] > waits.greatest[0] == -1.0  # the join is too near, the train ahead is fast
-    assert waits.greatest[1] > follows.greatest[1] == -1.0  # the other way round
+    assert follows.maximum[0] > waits.maximum[0] == -1.0  # the join is too near, the train ahead is fast
+    assert waits.maximum[1] > follows.maximum[1] == -1.0  # the other way round
     both = judged(FOLLOW, CLEAR)
-    np.testing.assert_array_equal(both.greatest, np.maximum(follows.greatest, waits.greatest))
+    np.testing.assert_array_equal(both.maximum, np.maximum(follows.maximum, waits.maximum))
     assert follows.emergency.tolist() == [False, True, False, False] and waits.emergency.tolist() == [True, False, False, False]
     assert not both.emergency.any()
     assert both.reason.tolist() == [TRAIN, SWITCH, LIMIT, TRAIN]

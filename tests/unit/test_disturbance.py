@@ -152,14 +152,14 @@ def test_own_seed_makes_an_entry_independent_of_the_others() -> None:
 
 def test_greatest_and_steady_values() -> None:
     e = entry(on="resistance", train=[2, 3], shape="constant", error_percent=[-20, 10])
-    np.testing.assert_allclose(e.greatest(IDS)[d.RESISTANCE], [0.0, 0.2, 0.1])
+    np.testing.assert_allclose(e.maximum(IDS)[d.RESISTANCE], [0.0, 0.2, 0.1])
     steady = e.steady(IDS)
     assert steady is not None
     np.testing.assert_allclose(steady[d.RESISTANCE], [0.0, -0.2, 0.1])
     assert entry(**NOISE).steady(IDS) is None
     assert entry(on="speed", shape="constant", amplitude_mps=1, to_s=5.0).steady(IDS) is None
-    assert np.all(entry(on="speed", shape="gaussian", std_mps=1).greatest(IDS)[d.SPEED] == np.inf)
-    assert np.all(entry(on="speed", shape="gaussian", std_mps=1, amplitude_mps=3).greatest(IDS)[d.SPEED] == 3.0)
+    assert np.all(entry(on="speed", shape="gaussian", std_mps=1).maximum(IDS)[d.SPEED] == np.inf)
+    assert np.all(entry(on="speed", shape="gaussian", std_mps=1, amplitude_mps=3).maximum(IDS)[d.SPEED] == 3.0)
 
 
 # --- mistakes ---

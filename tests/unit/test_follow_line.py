@@ -164,7 +164,7 @@ def test_a_run_off_the_end_is_told(tmp_path):
     with pytest.raises(InputError) as error:  # it stops before the end, but this law wants a reference that never stands
         open_scenario(scenario(tmp_path, "stop_m = 19000.0", duration=3000))
     assert [m.partition(": ")[2] for m in error.value.mistakes] == [
-        "reference.speed_mps = 0: must be above the least speed 0 m/s (all trains)"
+        "reference.speed_mps = 0: must be above the minimum speed 0 m/s (all trains)"
     ]
 
 

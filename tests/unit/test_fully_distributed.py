@@ -182,9 +182,9 @@ def said(sc: Scene, **params: str) -> str:
         (scene(LEGAL, PAIR, speeds=(80.0, 85.0)),
          "bounds.speed_lower_mps = 80: must be below the reference speed 80 m/s (Assumption 2.3)"),
         (scene(LEGAL, PAIR, speeds=(75.0, np.inf)), "bounds.speed_upper_mps = inf: needs a finite bound (Assumption 2.3)"),
-        (scene(LEGAL, PAIR, inputs=(0.2, 11.0)), "bounds.input_lower_mps2 = 0.2: must be below the least running resistance, "
+        (scene(LEGAL, PAIR, inputs=(0.2, 11.0)), "bounds.input_lower_mps2 = 0.2: must be below the minimum running resistance, "
          "0.159972 m/s2 at 75 m/s (Assumption 2.4)"),
-        (scene(LEGAL, PAIR, inputs=(-11.0, 0.1)), "bounds.input_upper_mps2 = 0.1: must be above the greatest running resistance, "
+        (scene(LEGAL, PAIR, inputs=(-11.0, 0.1)), "bounds.input_upper_mps2 = 0.1: must be above the maximum running resistance, "
          "0.193334 m/s2 at 85 m/s (Assumption 2.4)"),
         (scene(LEGAL, PAIR, inputs=(-0.7, 11.0)),
          "bounds.input_lower_mps2 = -0.7: must be below -4.84003 to brake from 85 to 80 m/s "

@@ -98,7 +98,7 @@ def test_the_first_violation_is_located_and_told_once(units):
 def test_spacing_and_collision(units):
     watched = Watched(units)
     place = row_of(units).seen.position.copy()
-    place[2] = place[3] + 300.0  # 420 m is the least, the train 320 m long
+    place[2] = place[3] + 300.0  # 420 m is the minimum, the train 320 m long
     line = units.line
     laid = ways(
         [[line.index[e] for e in line.route(t.track, t.position_m)] for t in units.scenario.train], line.start_m, line.length_m

@@ -139,7 +139,7 @@ REFUSED: list[tuple[law.Params, dict[str, Any], list[str]]] = [
     (PARAMS, {"links": links_of(LINE)._replace(desired=BENT)}, ["link[3 > 4].desired_m = 8000", "9000 m", "around every cycle"]),
     (PARAMS, {"reference": constant(90.0, 0.0)}, ["reference.speed_mps = 90", "below the maximum speed 85 m/s (all trains)"]),
     (PARAMS, {"reference": constant(85.0, 0.0)}, ["must be below the maximum speed 85"]),
-    (PARAMS, {"reference": constant(0.0, 0.0)}, ["must be above the least speed 0"]),
+    (PARAMS, {"reference": constant(0.0, 0.0)}, ["must be above the minimum speed 0"]),
     (
         PARAMS,
         {"bounds": BOUNDS._replace(input_upper=np.array([2.0, 1.9, 2.0, np.inf]))},

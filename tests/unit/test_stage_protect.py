@@ -24,11 +24,11 @@ def line(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize(("lower", "upper", "emergency", "greatest"), [(-1.0, 1.0, 1.065, 1.0), (-3.0, 2.0, 3.065, 2.0)])
-def test_the_supervisor_leaves_a_law_what_its_bounds_allow(line, lower, upper, emergency, greatest):
+@pytest.mark.parametrize(("lower", "upper", "emergency", "maximum"), [(-1.0, 1.0, 1.065, 1.0), (-3.0, 2.0, 3.065, 2.0)])
+def test_the_supervisor_leaves_a_law_what_its_bounds_allow(line, lower, upper, emergency, maximum):
     bounds = {"speed_lower_mps": 31.0, "speed_upper_mps": 38.0, "input_lower_mps2": lower, "input_upper_mps2": upper}
     rules = prepared(line, "fully_distributed", bounds=bounds).supervision
-    assert rules.greatest_mps2 == greatest
+    assert rules.greatest_mps2 == maximum
     assert rules.emergency_mps2 == pytest.approx(emergency, abs=1e-3)
 
 

@@ -42,7 +42,7 @@ def test_curve_is_the_continuous_one():
 
 def test_a_train_alone_may_do_all_that_is_admitted():
     verdict = judged([0.0, 40.0])
-    assert verdict.greatest.tolist() == [1.0, 1.0] and verdict.least.tolist() == [0.0, -1.0]
+    assert verdict.maximum.tolist() == [1.0, 1.0] and verdict.minimum.tolist() == [0.0, -1.0]
     assert verdict.reason.tolist() == verdict.target.tolist() == [-1, -1] and not verdict.emergency.any()
 
 
@@ -57,7 +57,7 @@ def test_a_formation_of_one_speed_is_not_touched_from_one_step_of_way_beyond_the
 
 def test_behind_a_moving_train_the_relative_curve_admits_what_the_absolute_does_not():
     ahead = target(300.0, 50.0, moving=True)
-    assert judged(50.0, ahead).greatest[0] == 1.0
+    assert judged(50.0, ahead).maximum[0] == 1.0
     assert judged(50.0, ahead, params=Params(curve="absolute")).emergency[0]
     assert judged(50.0, target(300.0, 50.0, moving=False)).emergency[0]  # that one does not move
 
@@ -65,16 +65,16 @@ def test_behind_a_moving_train_the_relative_curve_admits_what_the_absolute_does_
 def test_emergency_distance_holds_whatever_the_speeds():
     params = Params(emergency_distance_m=80.0)
     fleeing = target(79.0, 60.0, moving=True)
-    assert judged(30.0, fleeing).greatest[0] == 1.0
+    assert judged(30.0, fleeing).maximum[0] == 1.0
     verdict = judged(30.0, fleeing, params=params)
-    assert verdict.emergency[0] and verdict.greatest[0] == verdict.least[0] == -1.0
-    assert judged(30.0, target(50.0, kind=SWITCH), params=params).greatest[0] == -1.0  # too late for it anyway
-    assert judged(2.0, target(50.0, kind=SWITCH), params=params).greatest[0] == 1.0  # the distance is one between trains
+    assert verdict.emergency[0] and verdict.maximum[0] == verdict.minimum[0] == -1.0
+    assert judged(30.0, target(50.0, kind=SWITCH), params=params).maximum[0] == -1.0  # too late for it anyway
+    assert judged(2.0, target(50.0, kind=SWITCH), params=params).maximum[0] == 1.0  # the distance is one between trains
 
 
 def test_too_late_is_emergency_braking_down_to_a_stand_and_no_more():
     verdict = judged([30.0, 0.4, 0.0], *(target(5.0, kind=END, train=i) for i in range(3)))
-    assert verdict.greatest.tolist() == verdict.least.tolist() == [-1.0, -0.4, 0.0]
+    assert verdict.maximum.tolist() == verdict.minimum.tolist() == [-1.0, -0.4, 0.0]
     assert verdict.emergency.tolist() == [True, True, False]
     assert [KINDS[r] for r in verdict.reason] == ["end"] * 3
 
@@ -84,7 +84,7 @@ def test_the_nearest_bind_names_kind_and_row():
     limits = Limits(np.array([0, 1]), np.array([5000.0, -1.0]), np.array([10.0, 20.0]))
     verdict = judged([24.0, 20.0], far, near, limits=limits)
     assert verdict.reason.tolist() == [SWITCH, LIMIT] and verdict.target.tolist() == [1, 1]
-    assert verdict.greatest[1] == 0.0
+    assert verdict.maximum[1] == 0.0
     assert judged(24.0, far, near, near).target[0] == 1  # of equals the first
 
 
@@ -93,19 +93,18 @@ def test_opposing_trains_share_what_is_left_of_the_way():
     each = [-1.0 + 5.0 / 20.0, -1.0 + 5.0 / 30.0]  # 5 m each, in 20 and 30 s of braking
     for left, expected in ((0.0, [-1.0, -1.0]), (10.0, each)):
         pair = [target(both + 20.0 + left, v, True, OPPOSING, i) for i, v in ((0, 30.0), (1, 20.0))]
-        np.testing.assert_allclose(judged([20.0, 30.0], *pair).greatest, expected)
+        np.testing.assert_allclose(judged([20.0, 30.0], *pair).maximum, expected)
 
 
 def test_a_stop_and_a_limit_are_braked_for_with_the_service_brake_until_the_emergency_brake_must():
     at = Limits(np.array([0]), np.array([0.0]), np.array([0.0]))
     for room in (800.0, 650.0):  # from 30 m/s 643 m with 0.7, 450 m with 1.0
-        assert -0.7 < judged(30.0, target(room, kind=STOP)).greatest[0] <= 1.0
+        assert -0.7 < judged(30.0, target(room, kind=STOP)).maximum[0] <= 1.0
     assert (
-        judged(30.0, target(550.0, kind=STOP)).greatest[0]
-        == judged(30.0, limits=at._replace(distance=np.array([550.0]))).greatest[0]
+        judged(30.0, target(550.0, kind=STOP)).maximum[0] == judged(30.0, limits=at._replace(distance=np.array([550.0]))).maximum[0]
     )
-    assert judged(30.0, target(550.0, kind=STOP)).greatest[0] == -0.7
-    assert judged(30.0, target(450.0, kind=STOP)).greatest[0] == pytest.approx(-1.0)
+    assert judged(30.0, target(550.0, kind=STOP)).maximum[0] == -0.7
+    assert judged(30.0, target(450.0, kind=STOP)).maximum[0] == pytest.approx(-1.0)
     assert judged(30.0, limits=at._replace(speed=np.array([28.0]))).emergency[0]  # in force and broken
 
 

@@ -60,7 +60,7 @@ class Files:
         self.sumocfg.write_text(SUMOCFG.format(routes="r.rou.xml", more="s.add.xml", begin=begin, end=end))
         return self
 
-    def read(self, demand: str, **options: Any) -> Traffic:
+    def read(self, demand: str, **options: Any) -> Configuration:
         return read_traffic(self.write(demand, **options).sumocfg, self.folder / "work")
 
     def mistakes(self, demand: str, **options: Any) -> list[str]:

@@ -89,12 +89,12 @@ def _summary(done: Run, model: Model) -> None:
     )
     table.add_row("steps", f"{info['steps']} of {model.scenario.run.step_s:g} s in {info['wall_time_s']:.1f} s")
     for key, words, unit in (
-        ("bounds.spacing_lower_margin_m", "least spacing above its lower bound", "m"),
-        ("bounds.spacing_upper_margin_m", "least room below the upper spacing bound", "m"),
-        ("bounds.speed_lower_margin_mps", "least speed above its lower bound", "m/s"),
-        ("bounds.speed_upper_margin_mps", "least room below the upper speed bound", "m/s"),
-        ("bounds.input_lower_margin_mps2", "least input above its lower bound", "m/s2"),
-        ("bounds.input_upper_margin_mps2", "least room below the upper input bound", "m/s2"),
+        ("bounds.spacing_lower_margin_m", "minimum spacing above its lower bound", "m"),
+        ("bounds.spacing_upper_margin_m", "minimum room below the upper spacing bound", "m"),
+        ("bounds.speed_lower_margin_mps", "minimum speed above its lower bound", "m/s"),
+        ("bounds.speed_upper_margin_mps", "minimum room below the upper speed bound", "m/s"),
+        ("bounds.input_lower_margin_mps2", "minimum input above its lower bound", "m/s2"),
+        ("bounds.input_upper_margin_mps2", "minimum room below the upper input bound", "m/s2"),
         ("formation.settling_s", "all links within 1 m from", "s"),
         ("formation.final_error_m", "largest spacing error at the end", "m"),
     ):

@@ -64,9 +64,9 @@ def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
             for chosen, colour, label in ((~red, 0, "all bounds held"), (red, 1, "a bound broken")):
                 if chosen.any():
                     panel.plot(at[chosen], value[chosen], ".", markersize=3, color=style.COLOURS[colour], label=label)
-            least, most = np.nanmin(value), np.nanmax(value)
-            if most - least < ROUNDING:
-                panel.set_ylim(least - 1.0, most + 1.0)
+            minimum, most = np.nanmin(value), np.nanmax(value)
+            if most - minimum < ROUNDING:
+                panel.set_ylim(minimum - 1.0, most + 1.0)
             if key.startswith("bounds."):
                 panel.axhline(0.0, color="black", linestyle="--", linewidth=0.6)
             panel.set_ylabel(SHOWN[key])

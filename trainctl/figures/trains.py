@@ -294,19 +294,19 @@ def gaps(drawn: Drawn) -> Figure:
     for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
         if np.isfinite(gap[rows]).any():
             style.draw(axes[0], time[rows], gap[rows], label=f"{label} to the one ahead", **drawn.look[name])
-    wanted, least = set(), set()
+    wanted, minimum = set(), set()
     for (ahead, _), (_, rows) in zip(drawn.links.ends, drawn.links.slices(), strict=True):
         length = sum(drawn.known.length_m.get(ahead, (0.0,)))
         wanted |= set(np.unique(drawn.links.column("desired_m")[rows] - length).tolist())
-        least |= set(np.unique(drawn.links.column("lower_m")[rows] - length).tolist())
+        minimum |= set(np.unique(drawn.links.column("lower_m")[rows] - length).tolist())
     emergency = drawn.known.controller.get("emergency_distance_m")
     if isinstance(emergency, int | float):
-        least.add(float(emergency))
+        minimum.add(float(emergency))
     if len(wanted) <= 4:
         for value in wanted:
             axes[0].axhline(value / 1000, color="black", linestyle=":", linewidth=0.9, label="desired", zorder=3)
-    if len(least) <= 4:
-        style.bound(axes[0], *(value / 1000 for value in least), label="least allowed")
+    if len(minimum) <= 4:
+        style.bound(axes[0], *(value / 1000 for value in minimum), label="minimum allowed")
     axes[0].set_ylabel("gap [km]")
     _finish(figure, axes, drawn)
     return figure

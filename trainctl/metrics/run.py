@@ -28,15 +28,15 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
     "run.trains": ("1", "Trains in the log."),
     "run.train_km": ("km", "Distance covered by all trains together."),
     "bounds.spacing_lower_margin_m": (
-        "m", "Least spacing minus lower bound of a link, front to front, from one control period after the link was made on "
+        "m", "Minimum spacing minus lower bound of a link, front to front, from one control period after the link was made on "
         "(k >= 1: the first instant is given, not controlled); negative: broken."),
-    "bounds.spacing_upper_margin_m": ("m", "Least upper bound minus spacing of a link, counted in the same way."),
-    "bounds.speed_lower_margin_mps": ("m/s", "Least speed minus lower bound."),
-    "bounds.speed_upper_margin_mps": ("m/s", "Least upper bound minus speed."),
-    "bounds.input_lower_margin_mps2": ("m/s2", "Least applied input minus lower bound."),
-    "bounds.input_upper_margin_mps2": ("m/s2", "Least upper bound minus applied input."),
-    "bounds.coupler_lower_margin_m": ("m", "Least coupler displacement minus lower bound, over all sub-steps."),
-    "bounds.coupler_upper_margin_m": ("m", "Least upper bound minus coupler displacement, over all sub-steps."),
+    "bounds.spacing_upper_margin_m": ("m", "Minimum upper bound minus spacing of a link, counted in the same way."),
+    "bounds.speed_lower_margin_mps": ("m/s", "Minimum speed minus lower bound."),
+    "bounds.speed_upper_margin_mps": ("m/s", "Minimum upper bound minus speed."),
+    "bounds.input_lower_margin_mps2": ("m/s2", "Minimum applied input minus lower bound."),
+    "bounds.input_upper_margin_mps2": ("m/s2", "Minimum upper bound minus applied input."),
+    "bounds.coupler_lower_margin_m": ("m", "Minimum coupler displacement minus lower bound, over all sub-steps."),
+    "bounds.coupler_upper_margin_m": ("m", "Minimum upper bound minus coupler displacement, over all sub-steps."),
     "bounds.broken": ("1", f"Number of kinds of bound (the eight margins above) broken by more than {SLACK:g} of their unit."),
     "bounds.first_violation_s": ("s", "Time of the first recorded instant at which a bound is broken; absent if none is."),
     "bounds.first_violation_who": ("text", "Which bound of whom is broken at that instant."),
@@ -57,8 +57,8 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
         "1", "Norm over time of a link's spacing error over that of the link ahead of it (neighbours, common instants); "
         "above 1 errors grow along the formation."),
     "string.peak_gain": ("1", "The same with the largest absolute error as the norm."),
-    "watched.<name>_min": ("as named", "Least value over all sub-steps of a quantity that the law constrains."),
-    "watched.<name>_max": ("as named", "Greatest value over all sub-steps of a quantity that the law constrains."),
+    "watched.<name>_min": ("as named", "Minimum value over all sub-steps of a quantity that the law constrains."),
+    "watched.<name>_max": ("as named", "Maximum value over all sub-steps of a quantity that the law constrains."),
     **driving.DEFINITIONS,
     **traffic.DEFINITIONS,
 }  # fmt: skip
@@ -112,7 +112,7 @@ def metrics(run: Run, *, band_m: float = 1.0, speed_band: float = 0.02, section_
 
 
 def of_bounds(trains: Series, units: Series, links: Series, known: Facts) -> Values:
-    """Least margin to every bound, and the first instant at which one is broken."""
+    """Minimum margin to every bound, and the first instant at which one is broken."""
     values: Values = {}
     broken: list[tuple[float, str]] = []
     kinds: set[str] = set()

@@ -268,8 +268,8 @@ def room(consists: Consists, lower: Floats, upper: Floats) -> tuple[Floats, Floa
 
     Notes
     -----
-    Each unit carries its own mass's share, so the unit weakest per mass decides, traction at the speed where power leaves
-    least. Where rotating mass or Davis coefficients differ between units, their share of the input does too: it is taken at
+    Each unit carries its own mass's share, so the unit weakest per mass decides, traction at the speed where power leaves the
+    minimum. Where rotating mass or Davis coefficients differ between units, their share of the input does too: it is taken at
     161 speeds of the band.
     """
     low, high = np.full(len(lower), -np.inf), np.full(len(lower), np.inf)
@@ -290,8 +290,8 @@ def room(consists: Consists, lower: Floats, upper: Floats) -> tuple[Floats, Floa
 
 def sure_braking(params: Any, consists: Consists, top: Floats) -> Floats:
     """Deceleration every train can give on the level at any speed up to ``top`` (n,) [m/s2], shape (n,)."""
-    least, _ = room(consists, np.zeros_like(top), top)
-    return -least
+    minimum, _ = room(consists, np.zeros_like(top), top)
+    return -minimum
 
 
 def relied_on(

@@ -2,8 +2,9 @@
 
 Two kinds of places. A *join* is an edge that two or more edges lead into: the trains get a turn there, nobody is held, and the
 turns go to ``along.places``. A *stretch* is a longest run of edges on a train's way that others use as well, on the twin (single
-track) or across: it is exclusive against those, while trains that go the same way may follow each other. A train requests what lies
-within its reach, and keeps its request until its rear has left or its way no longer leads there. What it has passed is free at once.
+track) or across: it is exclusive against those, while trains that go the same way may follow each other. A train requests what
+lies within its reach, and keeps its request until its rear has left or its way no longer leads there. What it has passed is free
+at once.
 
 Deadlock: a train is let into a stretch only if behind it, before the next stretch, it finds room to stand with all who will stand
 there, or else together with the next one. While it waits for that, later trains may overtake it; this is the only exception to
@@ -102,7 +103,7 @@ def request(
     clearance : float
         Room one standing train needs beyond its length [m].
     entering : ndarray, shape (n,), optional
-        Trains that are not on the net yet and ask to be, at ``row`` and ``s``: they request, and may enter once their room is not 0.
+        Trains that are not on the net yet and ask to be, at ``row`` and ``s``: they may enter once their room is not 0.
 
     Returns
     -------

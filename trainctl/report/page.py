@@ -139,7 +139,7 @@ def _about(drawn: Drawn) -> str:
 
 
 def _margins(values: Mapping[str, Any]) -> list[tuple[str, str, float, str]]:
-    """Of every kind of bound: words, unit, least margin, whose it is."""
+    """Of every kind of bound: words, unit, minimum margin, whose it is."""
     found = []
     for name, (words, unit) in BOUNDS.items():
         key = f"bounds.{name}"

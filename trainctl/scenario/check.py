@@ -44,8 +44,8 @@ def facts(p: Model) -> dict[str, Any]:
             and np.all(np.isfinite(p.bounds.speed_lower) & np.isfinite(p.bounds.speed_upper))
         ):
             speed = np.full(len(p.scenario.ids), p.leader(0.0)[1])
-            least = shared.smallest_period(p.consists, speed, p.bounds.speed_lower, p.bounds.speed_upper)
-            found["smallest_control_period_s"] = round(float(np.max(least)), 6)
+            minimum = shared.smallest_period(p.consists, speed, p.bounds.speed_lower, p.bounds.speed_upper)
+            found["smallest_control_period_s"] = round(float(np.max(minimum)), 6)
             found["input_room_mps2"] = [round(float(p.bounds.input_lower.max()), 6), round(float(p.bounds.input_upper.min()), 6)]
     else:
         found["sub_step_s"] = scene.sub_step

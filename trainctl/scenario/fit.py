@@ -18,9 +18,9 @@ def can_brake(p: Model) -> list[str]:
     if not len(short):
         return []
     i = int(short[np.argmin(p.sure_braking[short])])
-    least, among = p.sure_braking[i], f" (and {len(short) - 1} other trains too little)" if len(short) > 1 else ""
+    minimum, among = p.sure_braking[i], f" (and {len(short) - 1} other trains too little)" if len(short) > 1 else ""
     return [
-        f"supervisor.emergency_mps2 = {rules.emergency_mps2:g}: train {p.scenario.ids[i]} can brake with {least:.6g} m/s2 at"
+        f"supervisor.emergency_mps2 = {rules.emergency_mps2:g}: train {p.scenario.ids[i]} can brake with {minimum:.6g} m/s2 at"
         f" most{among}"
     ]
 
@@ -41,17 +41,17 @@ def fits(p: Model) -> list[str]:
         return found + list(p.law.unfit(p.scenario))
     found += [*_messages_fit(p), *_disturbances_fit(p)]
     if p.sampled:
-        least, greatest = room(p.scenario.bounds_of_trains(), p.plant, p.consists)
+        minimum, maximum = room(p.scenario.bounds_of_trains(), p.plant, p.consists)
         for i, t in enumerate(p.scenario.train):
-            if p.bounds.input_lower[i] < least[i] - 1e-12:
+            if p.bounds.input_lower[i] < minimum[i] - 1e-12:
                 found.append(
                     f"train[{t.id}].input_lower_mps2 = {p.bounds.input_lower[i]:g}: its units can brake with"
-                    f" {-least[i]:.6g} m/s2 at most"
+                    f" {-minimum[i]:.6g} m/s2 at most"
                 )
-            if p.bounds.input_upper[i] > greatest[i] + 1e-12:
+            if p.bounds.input_upper[i] > maximum[i] + 1e-12:
                 found.append(
                     f"train[{t.id}].input_upper_mps2 = {p.bounds.input_upper[i]:g}: its units can give"
-                    f" {greatest[i]:.6g} m/s2 at most in the speed band"
+                    f" {maximum[i]:.6g} m/s2 at most in the speed band"
                 )
     return found
 

@@ -75,7 +75,7 @@ class Model:
     def supervision(self) -> supervisor.Params:
         """How trains are protected: as the scenario says, else only where they come and go.
 
-        Where the scenario states no emergency braking, and no greatest acceleration, they are the supervisor's usual ones, or more
+        Where the scenario states no emergency braking, and no maximum acceleration, they are the supervisor's usual ones, or more
         if the bounds of the inputs allow the law more: it must not act on what the law may do. No braking is relied on that some
         train cannot give.
         """
@@ -211,7 +211,7 @@ class Model:
 
     @cached_property
     def band(self) -> tuple[float, float]:
-        """Least and greatest speed of a convoy's reference that the law takes [m/s]; infinite where there are no convoys."""
+        """Minimum and maximum speed of a convoy's reference that the law takes [m/s]; infinite where there are no convoys."""
         return speed_band(self) if not self.placed and self.roster.cooperates.sum() > 1 else (-math.inf, math.inf)
 
     @property
@@ -256,7 +256,7 @@ BAND_MPS = 0.05
 
 
 def speed_band(p: Model) -> tuple[float, float]:
-    """Least and greatest speed of a reference with which the law takes one train of each kind as a formation [m/s]."""
+    """Minimum and maximum speed of a reference with which the law takes one train of each kind as a formation [m/s]."""
     spacing = p.spacing
     cruise = float(p.scenario.reference.speed_mps or 0.0)
     kinds = np.unique([t.type for t in p.scenario.train], return_index=True)[1]

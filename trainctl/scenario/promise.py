@@ -40,7 +40,7 @@ class Parts(NamedTuple):
     fall: Floats  # m/s2, of gravity on the steepest descent of its route
     climb: Floats  # m/s2, on the steepest ascent
     given: Floats  # m/s2, what brakes and slope leave of full braking, with all faults
-    pull: Floats  # m/s2, greatest force per mass at its top speed
+    pull: Floats  # m/s2, maximum force per mass at its top speed
     input: Floats  # m/s2, w3, and a bias of faulty actuators
     speed: Floats  # m/s2, w2 / T
     resistance: Floats  # m/s2, e R
@@ -82,18 +82,18 @@ def parts(p: Model) -> Parts:
     """Numbers behind ``assume``, for every train of a scenario."""
     n, c, run, b = len(p.scenario.ids), p.consists, p.scenario.run, p.supervision.emergency_mps2
     top, (down, up) = top_speed(p), _slopes(p)
-    greatest = np.zeros((len(disturbance.CHANNELS), n))
+    maximum = np.zeros((len(disturbance.CHANNELS), n))
     for entry in p.scenario.disturbance:
-        greatest += entry.greatest(p.scenario.ids, DEVIATIONS)
-    error = greatest[disturbance.RESISTANCE] * resistance(top, c.train_davis())
+        maximum += entry.maximum(p.scenario.ids, DEVIATIONS)
+    error = maximum[disturbance.RESISTANCE] * resistance(top, c.train_davis())
     fall = GRAVITY * down
     sure = p.plant.relied_on(p.plant_params, c, p.scenario.fault, p.scenario.ids, b, top, fall, DEVIATIONS)
     given = np.minimum(sure.braking, -p.clamps.input_lower - fall)
     pull = np.minimum(sure.pull, p.clamps.input_upper)
     return Parts(
-        top=top, fall=fall, climb=GRAVITY * up, given=given, pull=pull, input=greatest[disturbance.INPUT] + sure.bias,
-        speed=greatest[disturbance.SPEED] / run.step_s, resistance=error + sure.late, noise=sure.noise,
-        position=greatest[disturbance.POSITION], measured=greatest[disturbance.MEASUREMENT], lag=sure.lag,
+        top=top, fall=fall, climb=GRAVITY * up, given=given, pull=pull, input=maximum[disturbance.INPUT] + sure.bias,
+        speed=maximum[disturbance.SPEED] / run.step_s, resistance=error + sure.late, noise=sure.noise,
+        position=maximum[disturbance.POSITION], measured=maximum[disturbance.MEASUREMENT], lag=sure.lag,
     )  # fmt: skip
 
 
@@ -261,7 +261,7 @@ def told(p: Model) -> dict[str, Any]:
 def _unbounded(p: Model) -> bool:
     """Whether anything random has no bound, so that the promise holds with a probability only."""
     noisy = p.plant.noise_hold(p.plant_params) is not None
-    return noisy or any(not np.isfinite(entry.greatest(p.scenario.ids)).all() for entry in p.scenario.disturbance)
+    return noisy or any(not np.isfinite(entry.maximum(p.scenario.ids)).all() for entry in p.scenario.disturbance)
 
 
 def sentences(said: dict[str, Any]) -> list[str]:
@@ -272,7 +272,7 @@ def sentences(said: dict[str, Any]) -> list[str]:
         "no law causes a collision, passes a held switch or exceeds the line's limits, as long as:"
         if said["mode"] == "on"
         else "monitored only, nothing is prevented; what would be assumed:",
-        f"every train brakes with at least {said['relied_on_mps2']:.4g} m/s2 up to {said['top_speed_mps']:.4g} m/s (least: train"
+        f"every train brakes with at least {said['relied_on_mps2']:.4g} m/s2 up to {said['top_speed_mps']:.4g} m/s (minimum: train"
         f" {said['relied_on_of']}; ordered {said['full_braking_mps2']:.4g}, brakes and slope leave"
         f" {said['brakes_and_slope_leave_mps2']:.4g})",
     ]

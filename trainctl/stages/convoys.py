@@ -23,7 +23,7 @@ from trainctl.topology import convoys
 #: A train that waits to couple asks its law again after this [s].
 ASK_AGAIN_S = 2.0
 
-#: A formation dissolves this share of the cruising speed above the least speed its law can hold; to form it needs thrice that.
+#: A formation dissolves this share of the cruising speed above the minimum speed its law can hold; to form it needs thrice that.
 DISSOLVES = 0.02
 
 #: A train that uncoupled does not couple again to the same one within this time [s].
@@ -47,7 +47,7 @@ class Convoys:
     def __init__(self, p: Model, journal: Journal) -> None:
         self.p, self.journal, self.roster = p, journal, p.roster
         self.n, self.step_s, self.spacing = len(p.scenario.ids), p.scenario.run.step_s, p.spacing
-        self.least = p.band[0]
+        self.minimum = p.band[0]
 
     def initial(self) -> tuple[State, Formed]:
         """Everybody alone, at his own speed."""
@@ -169,8 +169,8 @@ class Convoys:
         asks.ahead[i] = -1
 
     def _too_slow(self, asks: _Asking) -> Ints:
-        """Coupled trains of formations whose reference nears the least speed the law can hold."""
-        slow = asks.pace.speed < self.least + DISSOLVES * self.p.cruise
+        """Coupled trains of formations whose reference nears the minimum speed the law can hold."""
+        slow = asks.pace.speed < self.minimum + DISSOLVES * self.p.cruise
         return np.flatnonzero((asks.ahead >= 0) & slow[convoys.fronts(asks.ahead)])
 
     def _slows_soon(self, own: Floats, view: View, asks: _Asking) -> Bools:
@@ -179,7 +179,7 @@ class Convoys:
         lines = view.limits
         close = lines.distance < SOON_S * np.maximum(speed, 1.0)[lines.train]
         np.minimum.at(lowest, lines.train[close], self.p.driving.below(lines.speed[close]))
-        slows = lowest < self.least + 3.0 * DISSOLVES * self.p.cruise
+        slows = lowest < self.minimum + 3.0 * DISSOLVES * self.p.cruise
         found: Bools = slows | slows[convoys.fronts(asks.ahead)][view.ahead.train]
         return found
 

@@ -71,7 +71,7 @@ MEASURED = (
 COLUMNS = {
     "row": "row", "headway [s]": "headway_s", "mean [s]": "headway_mean_s", "trains/h": "trains_per_hour",
     "journey [s]": "journey_time_s", "kWh/km": "energy_kwh_per_train_km", "collided": "collisions",
-    "least gap [m]": "least_gap_m", "spacing [m]": "spacing_m", "wall time [s]": "wall_time_s",
+    "minimum gap [m]": "least_gap_m", "spacing [m]": "spacing_m", "wall time [s]": "wall_time_s",
 }  # fmt: skip
 
 LINE_FILE = "capacity.toml"
@@ -160,7 +160,7 @@ def _sumo(plan: CapacityPlan, row: str, tables: dict[str, Any]) -> dict[str, Any
 
 
 def headway_bound(plan: CapacityPlan, block: str) -> float:
-    """Least time between two trains [s] of which the second never brakes, if the first keeps the line's speed.
+    """Minimum time between two trains [s] of which the second never brakes, if the first keeps the line's speed.
 
     It sees the absolute braking distance ahead of it free: up to the last signal before the train ahead, or up to 50 m from it. The
     step of 1 s in which SUMO decides comes on top.
@@ -359,14 +359,14 @@ def one(file: Path, out: Path, plan: CapacityPlan) -> dict[str, Any]:
 #: Panels: key -> label.
 PANELS = {
     "headway_s": "headway at\nthe end [s]", "trains_per_hour": "trains per\nhour [1/h]", "journey_time_s": "journey\ntime [s]",
-    "energy_kwh_per_train_km": "traction energy\n[kWh per train-km]", "least_gap_m": "least gap [m]\n(collisions)",
+    "energy_kwh_per_train_km": "traction energy\n[kWh per train-km]", "least_gap_m": "minimum gap [m]\n(collisions)",
 }  # fmt: skip
 
 
 def figure(table: Sequence[dict[str, Any]], plan: CapacityPlan, path: Path, formats: Sequence[str] = ("png",)) -> list[Path]:
     """Draw the table as bars, with what each row could reach at best dashed.
 
-    Dashed is steady running that nobody hinders: in SUMO's rows at the line's speed, at the least headway at which no train brakes;
+    Dashed is steady running that nobody hinders: in SUMO's rows at the speed of the line and the minimum headway without braking;
     in the laws' rows at cruising speed and the desired spacing.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg

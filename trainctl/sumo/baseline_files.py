@@ -79,7 +79,7 @@ def departures(p: Model) -> list[Vehicle]:
 
 
 def _top_speeds(p: Model) -> Floats:
-    """Greatest speed of every train [m/s], shape (n,)."""
+    """Maximum speed of every train [m/s], shape (n,)."""
     if p.params.top_speed_mps is not None:
         return np.full(len(p.scenario.ids), p.params.top_speed_mps)
     instants = np.arange(p.scenario.run.steps + 1) * p.scenario.run.step_s
