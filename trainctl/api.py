@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 #: What a run tells of itself in a notebook: metric -> words.
 HEADLINES = {
-    "bounds.broken": "kinds of bound broken",
+    "bounds.broken": "kinds of bound violated",
     "bounds.spacing_lower_margin_m": "minimum spacing above its lower bound [m]",
     "bounds.spacing_upper_margin_m": "minimum room below the upper spacing bound [m]",
     "formation.settling_s": "all links within 1 m from [s]",

@@ -14,8 +14,8 @@ MARGIN = "bounds.spacing_lower_margin_m"
 def words(statuses: list[str], path: Path) -> str:
     """All text of the figure of a sweep whose runs ended so."""
     margins = [200.0 + k if status == "complete" else None for k, status in enumerate(statuses)]
-    broken = [0 if status == "complete" else None for status in statuses]
-    frame = pd.DataFrame({"run.seed": range(len(statuses)), "status": statuses, "violations": broken, MARGIN: margins})
+    violated = [0 if status == "complete" else None for status in statuses]
+    frame = pd.DataFrame({"run.seed": range(len(statuses)), "status": statuses, "violations": violated, MARGIN: margins})
     summary(frame, ["run.seed"], path / "summary.svg")
     return " ".join(re.findall(r"<text[^>]*>([^<]*)</text>", (path / "summary.svg").read_text()))
 

@@ -48,13 +48,13 @@ class Watched:
 
 
 def told(watched, row, laid=None):
-    """What is broken; bodies and limits only where it is said which ways the trains have."""
+    """What is violated; bodies and limits only where it is said which ways the trains have."""
     seen = row.seen if laid else row.seen._replace(present=np.zeros(len(row.speed), bool))
     return [(a["bound"], a["who"], a["value"], a["limit"]) for a in watched.alarms.new(row, laid or NO_WAYS, seen, watched.state)]
 
 
 def told_of_links(watched, *arguments):
-    """What is broken as links change."""
+    """What is violated as links change."""
     return list(watched.alarms.relinked(*arguments, watched.state))
 
 
@@ -79,7 +79,7 @@ def tolerant():
 def test_a_quiet_row_is_silent(units):
     watched = Watched(units)
     assert told(watched, row_of(units)) == []
-    assert (watched.tally.broken, watched.tally.first) == ({}, {})
+    assert (watched.tally.violated, watched.tally.first) == ({}, {})
 
 
 def test_the_first_violation_is_located_and_told_once(units):
@@ -92,7 +92,7 @@ def test_the_first_violation_is_located_and_told_once(units):
     slow[4] = 70.0
     assert told(watched, row_of(units, 9.0, speed=slow)) == [("speed_lower_mps", "5", 70.0, 79.0)]
     assert watched.tally.first == {"time_s": 7.0, "bound": "speed_upper_mps", "who": "2", "value": 86.5, "limit": 85.0}
-    assert watched.tally.broken == {"speed_upper_mps": {"2": 3}, "speed_lower_mps": {"5": 1}}
+    assert watched.tally.violated == {"speed_upper_mps": {"2": 3}, "speed_lower_mps": {"5": 1}}
 
 
 def test_spacing_and_collision(units):
@@ -186,7 +186,7 @@ def test_energies_balance_far_better_than_demanded(name, settings, tmp_path):
         balance = watched.energy
         assert np.all(balance.turnover > 1e6)
         assert np.max(np.abs(balance.drift) / balance.turnover) < 1e-5
-        assert "energy_balance_share" not in watched.tally.broken
+        assert "energy_balance_share" not in watched.tally.violated
 
 
 def test_energy_from_nowhere_is_found(tmp_path):
@@ -197,7 +197,7 @@ def test_energy_from_nowhere_is_found(tmp_path):
         simulation.plant.plant.units[8:12, PER_INERTIA] *= 1.1
         simulation.run()
         tally = simulation.state.watch.alarms.tally
-        assert list(tally.broken["energy_balance_share"]) == ["3"]
+        assert list(tally.violated["energy_balance_share"]) == ["3"]
         assert tally.first["time_s"] > 20
 
 
@@ -206,12 +206,12 @@ def test_a_kick_is_accounted_for(units):
     state = balance.initial()
     own = units.own.copy()
     kick = np.array([0.5, 0, 0, 0, 0, 0])
-    assert list(balance.broken(row_of(units, disturbed=SimpleNamespace(speed=kick)), state)) == []
+    assert list(balance.violated(row_of(units, disturbed=SimpleNamespace(speed=kick)), state)) == []
     own[:4, SPEED] += 0.5
-    assert list(balance.broken(row_of(units, own=own), state)) == []
+    assert list(balance.violated(row_of(units, own=own), state)) == []
     assert abs(state.drift[0]) < 1.0
     own[4:8, SPEED] += 0.5  # nobody kicked train 2
-    assert [i for i, _ in balance.broken(row_of(units, own=own), state)] == [1]
+    assert [i for i, _ in balance.violated(row_of(units, own=own), state)] == [1]
 
 
 def test_what_alarms_remember_survives(units):

@@ -111,11 +111,11 @@ def test_a_train_that_has_just_come_has_not_moved():
     watch = Watch(("A", "B"), np.zeros(2), np.ones(2), rails, line, net=False)
     laid = ways([[0], [0]], np.zeros(1), np.array([100.0]))
     seen, last = Seen(np.array([10.0, 20.0]), np.zeros(2, np.int64), laid.first[:-1], np.array([True, False])), watch.initial()
-    assert list(watch.broken(laid, seen, np.full(2, 25.0), last)) == []
+    assert list(watch.violated(laid, seen, np.full(2, 25.0), last)) == []
     seen = seen._replace(position=np.array([35.0, 20.0]), present=np.array([True, True]))
-    assert list(watch.broken(laid, seen, np.full(2, 25.0), last)) == []
+    assert list(watch.violated(laid, seen, np.full(2, 25.0), last)) == []
     seen = seen._replace(position=np.array([60.0, 80.0]))
-    told, fast = watch.broken(laid, seen, np.array([25.0, 60.0]), last)
+    told, fast = watch.violated(laid, seen, np.array([25.0, 60.0]), last)
     assert fast == {"bound": "line_speed_mps", "who": "B", "value": 60.0, "limit": 30.0, "edge": "a"}
     assert told == {
         "bound": "gap_m", "who": "A-B", "value": -20.0, "limit": 0.0, "trains": ["A", "B"], "edge": "a", "edge_m": 80.0, "track": "1",

@@ -48,7 +48,7 @@ def run(
     ] = None,
     settings: Settings = None,
     force: Annotated[bool, typer.Option("--force", help="Replace whatever lies at the run folder.")] = False,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if any bound was broken.")] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if any bound was violated.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no summary.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -136,7 +136,7 @@ def check(name: ScenarioName = DEFAULT_SCENARIO, settings: Settings = None, as_j
     if as_json:
         show_json(found)
         return
-    print(f"{model.file}: no mistakes, no start condition of {model.scenario.controller.law} broken")
+    print(f"{model.file}: no mistakes, no start condition of {model.scenario.controller.law} violated")
     table = listing(None, "", "")
     table.show_header = False
     for key, value in found.items():

@@ -212,23 +212,23 @@ def _clamp_violations(scene: Scene) -> list[str]:
     found = []
     for field, row in bounds._asdict().items():
         key = f"bounds.{field}_{'mps2' if field.startswith('input') else 'mps'}"
-        found += _broken(scene, f"{key} =", row, ~np.isfinite(row), "must be given, the model (4) clamps every speed and input")
+        found += _violated(scene, f"{key} =", row, ~np.isfinite(row), "must be given, the model (4) clamps every speed and input")
         if field.endswith("upper"):
-            found += _broken(scene, f"{key} =", row, row <= 0.0, "must be above 0")
+            found += _violated(scene, f"{key} =", row, row <= 0.0, "must be above 0")
     low, high = bounds.speed_lower, bounds.speed_upper
-    found += _broken(scene, f"reference.speed_mps = {fastest:g}: must be below the maximum speed", high, fastest >= high, "m/s")
-    found += _broken(scene, f"reference.speed_mps = {slowest:g}: must be above the minimum speed", low, slowest <= low, "m/s")
-    found += _broken(scene, "bounds.speed_lower_mps =", low, np.isfinite(low) & (low < 0.0), "must not be negative")
-    found += _broken(scene, "bounds.input_lower_mps2 =", bounds.input_lower, bounds.input_lower >= 0.0, "must be below 0")
-    found += _broken(scene, "train.speed_mps =", speed, (speed < low) | (speed > high), "outside the admissible speeds")
+    found += _violated(scene, f"reference.speed_mps = {fastest:g}: must be below the maximum speed", high, fastest >= high, "m/s")
+    found += _violated(scene, f"reference.speed_mps = {slowest:g}: must be above the minimum speed", low, slowest <= low, "m/s")
+    found += _violated(scene, "bounds.speed_lower_mps =", low, np.isfinite(low) & (low < 0.0), "must not be negative")
+    found += _violated(scene, "bounds.input_lower_mps2 =", bounds.input_lower, bounds.input_lower >= 0.0, "must be below 0")
+    found += _violated(scene, "train.speed_mps =", speed, (speed < low) | (speed > high), "outside the admissible speeds")
     return found
 
 
-def _broken(scene: Scene, key: str, value: Floats, broken: Bools, rule: str) -> list[str]:
+def _violated(scene: Scene, key: str, value: Floats, violated: Bools, rule: str) -> list[str]:
     """One line per different value for all trains it concerns."""
     lines = []
-    for v in np.unique(value[broken]):
-        who = [scene.trains[i] for i in np.flatnonzero(broken & (value == v)).tolist()]
+    for v in np.unique(value[violated]):
+        who = [scene.trains[i] for i in np.flatnonzero(violated & (value == v)).tolist()]
         names = "all trains" if len(who) == len(scene.trains) else f"train {_some(who, ', ')}"
         between = ": " if key.endswith("=") else " "
         lines.append(f"{key} {v:g}{between}{rule} ({names})")
@@ -244,7 +244,7 @@ def _assumption_1(scene: Scene) -> list[str]:
             ratio = value / r
         short = np.isfinite(ratio) & (value > 0.0) & (ratio <= KAPPA)
         rule = f"times the running resistance is all the input allows, Assumption 1 needs more than {KAPPA:g}"
-        found += _broken(scene, f"bounds.{field}_mps2:", np.round(ratio, 2), short, rule)
+        found += _violated(scene, f"bounds.{field}_mps2:", np.round(ratio, 2), short, rule)
     return found
 
 

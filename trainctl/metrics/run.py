@@ -19,7 +19,7 @@ from trainctl.runs.run import Run
 from trainctl.runs.series import INSTANT, Pairs, Series, pairs, series
 from trainctl.signals import Floats
 
-#: A bound counts as broken beyond this (m, m/s or m/s2): positions read back from the simulator are exact to 3e-10 m.
+#: A bound counts as violated beyond this (m, m/s or m/s2): positions read back from the simulator are exact to 3e-10 m.
 SLACK = 1e-6
 
 #: name -> (unit, one-line definition)
@@ -29,7 +29,7 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
     "run.train_km": ("km", "Distance covered by all trains together."),
     "bounds.spacing_lower_margin_m": (
         "m", "Minimum spacing minus lower bound of a link, front to front, from one control period after the link was made on "
-        "(k >= 1: the first instant is given, not controlled); negative: broken."),
+        "(k >= 1: the first instant is given, not controlled); negative: violated."),
     "bounds.spacing_upper_margin_m": ("m", "Minimum upper bound minus spacing of a link, counted in the same way."),
     "bounds.speed_lower_margin_mps": ("m/s", "Minimum speed minus lower bound."),
     "bounds.speed_upper_margin_mps": ("m/s", "Minimum upper bound minus speed."),
@@ -37,9 +37,9 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
     "bounds.input_upper_margin_mps2": ("m/s2", "Minimum upper bound minus applied input."),
     "bounds.coupler_lower_margin_m": ("m", "Minimum coupler displacement minus lower bound, over all sub-steps."),
     "bounds.coupler_upper_margin_m": ("m", "Minimum upper bound minus coupler displacement, over all sub-steps."),
-    "bounds.broken": ("1", f"Number of kinds of bound (the eight margins above) broken by more than {SLACK:g} of their unit."),
-    "bounds.first_violation_s": ("s", "Time of the first recorded instant at which a bound is broken; absent if none is."),
-    "bounds.first_violation_who": ("text", "Which bound of whom is broken at that instant."),
+    "bounds.broken": ("1", f"Number of kinds of bound (the eight margins above) violated by more than {SLACK:g} of their unit."),
+    "bounds.first_violation_s": ("s", "Time of the first recorded instant at which a bound is violated; absent if none is."),
+    "bounds.first_violation_who": ("text", "Which bound of whom is violated at that instant."),
     "formation.settling_s": (
         "s", "Time after which every link stays within the band (default 1 m) of its desired spacing; None: never."),
     "formation.window_settling_s": (
@@ -112,9 +112,9 @@ def metrics(run: Run, *, band_m: float = 1.0, speed_band: float = 0.02, section_
 
 
 def of_bounds(trains: Series, units: Series, links: Series, known: Facts) -> Values:
-    """Minimum margin to every bound, and the first instant at which one is broken."""
+    """Minimum margin to every bound, and the first instant at which one is violated."""
     values: Values = {}
-    broken: list[tuple[float, str]] = []
+    violated: list[tuple[float, str]] = []
     kinds: set[str] = set()
 
     def margins(name: str, split: Series, margin: Floats, what: str) -> None:
@@ -127,7 +127,7 @@ def of_bounds(trains: Series, units: Series, links: Series, known: Facts) -> Val
             time = split.column("time_s")[hit]
             k = int(np.argmin(time))
             where = split.names[int(split.labels()[hit[k]])]
-            broken.append((float(time[k]), f"{what} of {where} by {-margin[hit[k]]:.6g}"))
+            violated.append((float(time[k]), f"{what} of {where} by {-margin[hit[k]]:.6g}"))
 
     if links.names:
         counted = links.column("age_s") >= known.control_period_s - INSTANT
@@ -153,8 +153,8 @@ def of_bounds(trains: Series, units: Series, links: Series, known: Facts) -> Val
         margins("coupler_lower_margin_m", units, lowest - known.coupler_m[0], "lower coupler bound [m] behind unit")
         margins("coupler_upper_margin_m", units, known.coupler_m[1] - highest, "upper coupler bound [m] behind unit")
     values["bounds.broken"] = len(kinds)
-    if broken:
-        values["bounds.first_violation_s"], values["bounds.first_violation_who"] = min(broken)
+    if violated:
+        values["bounds.first_violation_s"], values["bounds.first_violation_who"] = min(violated)
     return values
 
 

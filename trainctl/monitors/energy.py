@@ -54,7 +54,7 @@ class Balance:
         total: Floats = np.add.reduceat(each, self.heads)
         return total
 
-    def broken(self, row: Row, s: State) -> Iterator[tuple[int, float]]:
+    def violated(self, row: Row, s: State) -> Iterator[tuple[int, float]]:
         """Trains out of balance now, and by which share of their turnover. Every step's row must come by."""
         if row.extremes is not None:
             now = self.energy(row.own)

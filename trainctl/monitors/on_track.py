@@ -99,7 +99,7 @@ class Watch:
         """Front of every train a step ago [m], shape (n,); NaN where it was not there."""
         return np.full(len(self.length), np.nan)
 
-    def broken(self, ways: Ways, seen: Seen, speed: Floats, last: Floats) -> Iterator[dict[str, Any]]:
+    def violated(self, ways: Ways, seen: Seen, speed: Floats, last: Floats) -> Iterator[dict[str, Any]]:
         """What is wrong now, as fields of an event; ``seen`` counts as the ways do, ``speed`` (n,) [m/s].
 
         ``last`` (n,), where the fronts were a step ago, is overwritten in place.

@@ -321,13 +321,13 @@ def sweep(
         ordered = [{**rows[key], "run": job.number} for job in todo if (key := _key(job.parameters)) in rows]
         frame = write_results(ordered, out / RESULTS)
         counts = {name: sum(row["status"] == name for row in ordered) for name in ("complete", "failed", "refused")}
-        broken = sum(row["status"] == "complete" and row["violations"] > 0 for row in ordered)
+        violated = sum(row["status"] == "complete" and row["violations"] > 0 for row in ordered)
         complete = counts["complete"]
         violated = {
-            "runs": broken,
+            "runs": violated,
             "of": complete,
-            "share": broken / complete if complete else None,
-            "interval_95": wilson(broken, complete),
+            "share": violated / complete if complete else None,
+            "interval_95": wilson(violated, complete),
         }
         if complete:
             from trainctl.figures.sweep import summary
