@@ -55,10 +55,10 @@ class Recording:
     def look(self, sim: Any) -> None:
         """Write down where the fronts are, as the world measures it."""
         seen, ways = sim.world.measure(), sim.world.ways
-        own, heads = sim.state.own, self.p.heads
+        own, leading = sim.state.own, self.p.leading
         along = seen.position - ways.begin[ways.first[:-1]]
-        minimum = np.minimum.reduceat(own[:, 1], heads)
-        self.rows.append((sim.time, along, own[heads, 1].copy(), minimum, seen.present.copy()))
+        minimum = np.minimum.reduceat(own[:, 1], leading)
+        self.rows.append((sim.time, along, own[leading, 1].copy(), minimum, seen.present.copy()))
         self.ways = [ways.edge[a:b].copy() for a, b in zip(ways.first[:-1], ways.first[1:], strict=True)]
 
     def tracks(self) -> Tracks:

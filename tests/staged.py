@@ -79,9 +79,9 @@ def around(view: View, stops: tuple[list[int], list[float]] = ([], []), soon: Bo
 def side_by_side(p: Model, spacings: list[float], speed: float) -> tuple[Seen, Floats]:
     """Every train on the net, each so far behind the one before."""
     own, n = p.own.copy(), len(p.scenario.ids)
-    own[p.heads, POSITION], own[:, SPEED] = -np.cumsum([0.0, *spacings]), speed
+    own[p.leading, POSITION], own[:, SPEED] = -np.cumsum([0.0, *spacings]), speed
     nowhere = np.zeros(n, np.int64)
-    return Seen(own[p.heads, POSITION].copy(), nowhere, nowhere, np.ones(n, bool)), own
+    return Seen(own[p.leading, POSITION].copy(), nowhere, nowhere, np.ones(n, bool)), own
 
 
 def chained(formed: Formed, ahead: list[int]) -> Formed:

@@ -226,7 +226,7 @@ class Simulation:
     @property
     def speed_mps(self) -> Floats:
         """Speed of every train's head, shape (n,)."""
-        return np.asarray(self._loop.state.own[self._loop.p.heads, SPEED].copy())
+        return np.asarray(self._loop.state.own[self._loop.p.leading, SPEED].copy())
 
     @property
     def track(self) -> list[str]:

@@ -531,7 +531,7 @@ class Row(NamedTuple):
     seen: Seen
     track: Ints  # (n,)
     own: Floats  # (U, s)
-    speed: Floats  # (n,) m/s, of the heads
+    speed: Floats  # (n,) m/s, of the leading units
     ahead: Ints  # (n,) train ahead in the formation, -1 for the first
     links: Links
     motion: Motion | None

@@ -106,8 +106,8 @@ def start(
 
 
 def ended(world: World, x: np.ndarray) -> Targets:
-    heads = np.flatnonzero(world.first)
-    return fixed(heads, world.end - x[heads], END)
+    leading = np.flatnonzero(world.first)
+    return fixed(leading, world.end - x[leading], END)
 
 
 CASES = [(0.0, 0.2), (0.5, 0.2), (0.0, 1.0), (0.5, 1.0), (0.0, 2.0), (0.5, 0.7), (0.25, 0.5)]

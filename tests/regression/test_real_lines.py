@@ -40,7 +40,7 @@ braking_n = 64000.0
 actuator_rate_per_s = 2.0
 """
 
-#: Distances of a formation 1 km apart; the speed gain of the heads and the one between trains are not the paper's.
+#: Distances of a formation 1 km apart; the speed gain of the leading units and the one between trains are not the paper's.
 FINITE_TIME = """
 law = "emu_finite_time"
 mu_2 = 1.0

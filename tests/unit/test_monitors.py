@@ -25,10 +25,10 @@ def row_of(p, t=0.0, watched=0, **changes):
     """One quiet instant of a scenario's start."""
     n = len(p.scenario.train)
     own = p.own.copy()
-    heads = own[p.heads]
+    leading = own[p.leading]
     given = {
-        "time": t, "seen": Seen(heads[:, POSITION].copy(), np.zeros(n, np.int64), np.zeros(n, np.int64), np.ones(n, bool)), "track": p.start_track, "own": own,
-        "speed": heads[:, SPEED].copy(), "ahead": np.full(n, -1), "links": p.first_links,
+        "time": t, "seen": Seen(leading[:, POSITION].copy(), np.zeros(n, np.int64), np.zeros(n, np.int64), np.ones(n, bool)), "track": p.start_track, "own": own,
+        "speed": leading[:, SPEED].copy(), "ahead": np.full(n, -1), "links": p.first_links,
         "motion": Motion(*np.zeros((4, n)), np.zeros(n, bool), np.zeros(n, bool), None, {}),
         "led": np.ones(n, bool), "saturated": np.zeros(n, bool), "extremes": Extremes.fresh(n, len(own), watched), "disturbed": None,
     }  # fmt: skip
@@ -241,7 +241,7 @@ def test_ten_thousand_trains_are_watched_in_milliseconds(units):
     scenario = SimpleNamespace(ids=ids, train=ids, plant=units.scenario.plant, bounds=units.scenario.bounds)
     bounds = type(units.bounds)(*(np.full(n, b[0]) for b in units.bounds))
     p = SimpleNamespace(
-        scenario=scenario, consists=c, bounds=bounds, law=units.law, sampled=True, own=own, heads=c.first[:-1],
+        scenario=scenario, consists=c, bounds=bounds, law=units.law, sampled=True, own=own, leading=c.first[:-1],
         roster=SimpleNamespace(speed_factor=np.ones(n)), placed=True, has_units=True, driving=units.driving, line=units.line,
         rails=replace(units.rails, length_m=1e8 * np.ones_like(units.rails.length_m)),
     )  # fmt: skip

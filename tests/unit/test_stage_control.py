@@ -90,7 +90,7 @@ def test_a_law_s_own_clamps_hold_for_what_is_commanded():
     asked = Asked(p)
     assert asked.control.clamps
     asked.commanded[:] = -100.0
-    given, speed = asked.step(1), asked.own[p.heads, 1]
+    given, speed = asked.step(1), asked.own[p.leading, 1]
     np.testing.assert_allclose(given, (p.bounds.speed_lower - speed) / PERIOD, atol=1e-12)
     assert asked.demand.saturated.all()
 
@@ -118,7 +118,7 @@ def test_a_continuous_law_is_not_asked_here():
 def test_a_law_gets_back_the_state_it_gave(counting):
     asked = Asked(counting)
     assert counting.remembers and not open_scenario("three_tracks").remembers
-    lag = 80.0 - asked.own[counting.heads, 1]
+    lag = 80.0 - asked.own[counting.leading, 1]
     gain = counting.params.gain
     for number in range(3):
         for k in range(PERIOD):

@@ -92,12 +92,12 @@ def test_what_a_step_was_given_stays_as_it_was(p):
 def test_a_formation_is_measured_along_one_way(p):
     """The second comes over another way, whose positions say nothing of the spacing."""
     pair = Pair(p)
-    elsewhere = pair.own[p.heads[1] : p.heads[2], POSITION]
+    elsewhere = pair.own[p.leading[1] : p.leading[2], POSITION]
     elsewhere += 70_000.0
     pair.step()
-    heads = pair.own[p.heads, POSITION]
-    assert heads[0] - heads[1] == pytest.approx(1200.0) and pair.formed.offset[1] == pytest.approx(-70_000.0)
-    assert pair.seen.position[1] == heads[1] and pair.formed.offset[0] == 0.0
+    leading = pair.own[p.leading, POSITION]
+    assert leading[0] - leading[1] == pytest.approx(1200.0) and pair.formed.offset[1] == pytest.approx(-70_000.0)
+    assert pair.seen.position[1] == leading[1] and pair.formed.offset[0] == 0.0
     assert [part[1] for part in pair.formed.references.pace] == [part[0] for part in pair.formed.references.pace]  # one reference
 
 
@@ -110,7 +110,7 @@ def test_too_near_too_far_too_fast_do_not(line, law):
         pair.step()
         assert pair.told == []
     pair = Pair(p)
-    pair.own[p.heads[1] : p.heads[2], SPEED] += p.driving.join_band_mps + 0.1
+    pair.own[p.leading[1] : p.leading[2], SPEED] += p.driving.join_band_mps + 0.1
     pair.step()
     assert pair.told == []
 

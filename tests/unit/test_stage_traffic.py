@@ -52,7 +52,7 @@ def test_trains_of_one_edge_come_one_by_one(line):
 def test_a_train_enters_when_the_one_before_has_gone_far_enough(line):
     p = prepared(line, "robust_constrained")
     loop, told = started(p)
-    ids, heads = p.scenario.ids, p.heads
+    ids, leading = p.scenario.ids, p.leading
     first, second = ids.index("p.0"), ids.index("p.1")
     assert loop.state.traffic.came[first] and told.kinds()[0] == ("depart", "p.0")
     loop.step()
@@ -61,7 +61,7 @@ def test_a_train_enters_when_the_one_before_has_gone_far_enough(line):
             seen = loop.world.measure()
             seen.position[first] += metres
             told.clear()
-            speed = loop.state.own[heads, 1].copy()
+            speed = loop.state.own[leading, 1].copy()
             before = loop.state.traffic
             s, at = loop.traffic.step(40.0, loop.world.ways, seen, speed, 0.0 * speed, before)
             assert (second in [i for i, _ in at.entries]) is enters is bool(s.came[second]), metres

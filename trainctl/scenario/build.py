@@ -141,7 +141,7 @@ def model_of(
         found += placing.steep(model)
         if trains is None and not misplaced:
             model = replace(model, roster=roster.placed(scenario, network[0]))
-        if model.roster is not None and not unfit:  # else there are no numbers to rely on
+        if model.roster is not None:
             found += can_brake(model) or promise.refusals(model)
     if found:
         # What follows from a key that is wrong already is not a mistake of its own.

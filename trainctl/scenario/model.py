@@ -122,7 +122,7 @@ class Model:
         return promise.assume(self)
 
     @property
-    def heads(self) -> Ints:
+    def leading(self) -> Ints:
         """Rows of the head units in per-unit arrays, shape (n,)."""
         return self.consists.first[:-1]
 
@@ -268,7 +268,7 @@ def speed_band(p: Model) -> tuple[float, float]:
     slot = convoys.slots(ahead, order, spacing.desired, np.zeros(len(ahead)))
     links = convoys.links(ahead, order, slot, spacing)
     units, own = np.diff(p.consists.first), p.own.copy()
-    own[:, POSITION] += np.repeat(slot - own[p.heads, POSITION], units)
+    own[:, POSITION] += np.repeat(slot - own[p.leading, POSITION], units)
 
     def takes(v: float) -> bool:
         own[:, SPEED] = v

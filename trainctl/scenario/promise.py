@@ -52,7 +52,7 @@ class Parts(NamedTuple):
 
 def top_speed(p: Model) -> Floats:
     """Highest speed the line allows every train anywhere on its route, or that it starts with [m/s], shape (n,)."""
-    start = p.own[p.heads, SPEED]
+    start = p.own[p.leading, SPEED]
     if p.placed:
         highest: Floats = np.maximum(float(p.line.speed_mps.max()), start)
         return highest
@@ -67,7 +67,7 @@ def _slopes(p: Model) -> tuple[Floats, Floats]:
     """Steepest descent and ascent of every train's route, rise / run >= 0, shape (n,)."""
     if p.placed:
         breaks, slope = p.line.gradient.breaks, p.line.gradient.slope
-        rear = p.own[p.heads, POSITION] - p.consists.train_length()
+        rear = p.own[p.leading, POSITION] - p.consists.train_length()
         first = np.maximum(np.searchsorted(breaks, rear, side="right") - 1, 0)
         ahead = [slope[k:] for k in first.tolist()]
     elif p.scenario.event or not p.rails.slope.any():
@@ -137,6 +137,8 @@ def refusals(p: Model) -> list[str]:
     """What of the promise cannot be kept in a scenario with ``mode = "on"``, with the numbers that would do."""
     if p.supervision.mode != "on" or p.self_driven:
         return []
+    if p.plant.violations(p.plant_params, p.first_scene, p.scenario.fault):
+        return []  # told already; there are no numbers to rely on
     clamp = float(p.clamps.speed_lower.max())
     if clamp > 0.0:
         return [
@@ -200,7 +202,7 @@ def _lost(p: Model) -> list[str]:
     """Starts from which a collision or an overspeed cannot be averted. Trains that come later enter only where it is safe."""
     if not p.placed:
         return []
-    rules, speed, step = p.supervision, p.own[p.heads, SPEED], p.scenario.run.step_s
+    rules, speed, step = p.supervision, p.own[p.leading, SPEED], p.scenario.run.step_s
     laid = ways([[p.line.index[e] for e in route] for route in p.roster.routes], p.line.start_m, p.line.length_m)
     row, n = laid.first[:-1].copy(), len(speed)
     front = laid.begin[row] + p.roster.lane_position

@@ -65,9 +65,9 @@ class Control:
         disturbed: Disturbed,
     ) -> tuple[Demand, Formed, Messages, Any]:  # fmt: skip
         assert formed.links is not None
-        p, law, heads = self.p, self.p.law, own[self.p.heads]
+        p, law, leading = self.p, self.p.law, own[self.p.leading]
         leader = formed.references.leader(t)
-        trains = Trains(heads[:, POSITION] + disturbed.measurement, heads[:, SPEED], resistance)
+        trains = Trains(leading[:, POSITION] + disturbed.measurement, leading[:, SPEED], resistance)
         sent = law.message(formed.constants, trains, leader)
         number = k // p.scenario.run.held_steps
         messages, heard = exchange.deliver(self.radio, messages, sent, trains.position, formed.links, number)
@@ -88,7 +88,7 @@ class Control:
         """Speed and input clamps of a law whose model has them, for trains of units."""
         if not self.clamps:
             return demand
-        bounds, speed, asked = self.p.bounds, own[self.p.heads, SPEED], demand.acceleration
+        bounds, speed, asked = self.p.bounds, own[self.p.leading, SPEED], demand.acceleration
         period = self.p.scenario.run.control_period_s or self.p.scenario.run.step_s
         given = np.clip(asked, bounds.input_lower - resistance, bounds.input_upper - resistance)
         given = np.clip(given, (bounds.speed_lower - speed) / period, (bounds.speed_upper - speed) / period)

@@ -59,7 +59,7 @@ class Protect:
         """
         if view is None or self.rules.mode == "off":
             return over_the_step(driven.ordered, disturbed, state, False), acting
-        verdict = self._verdict(view, own[self.p.heads, SPEED], acceleration, swing, disturbed.measurement)
+        verdict = self._verdict(view, own[self.p.leading, SPEED], acceleration, swing, disturbed.measurement)
         calm = disturbed.calm() if self.disturbing else disturbed
         moved = over_the_step(driven.ordered, calm, plant.copied(state), True)
         within, acts = applied(verdict, moved.motion.asked)
@@ -68,7 +68,7 @@ class Protect:
         if acts_on or self.disturbing:
             ordered = np.where(acts, within, driven.ordered) if acts_on else driven.ordered
             moved = over_the_step(ordered, disturbed, state, False)
-        self._tell(t, verdict, acts, acting, view, own[self.p.heads, SPEED])
+        self._tell(t, verdict, acts, acting, view, own[self.p.leading, SPEED])
         return moved, acts
 
     def _verdict(self, view: View, speed: Floats, acceleration: Floats, swing: Floats, error: Floats) -> supervisor.Verdict:

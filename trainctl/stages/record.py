@@ -169,7 +169,7 @@ class Record:
         """
         assert formed.links is not None
         row = Row(
-            time=t, seen=seen, track=self.track_of[seen.edge], own=own, speed=own[self.p.heads, SPEED], ahead=formed.ahead,
+            time=t, seen=seen, track=self.track_of[seen.edge], own=own, speed=own[self.p.leading, SPEED], ahead=formed.ahead,
             links=formed.links, motion=motion, saturated=demand.saturated if motion is None else demand.saturated | motion.limited,
             extremes=past, disturbed=disturbed, led=formed.led,
         )  # fmt: skip
