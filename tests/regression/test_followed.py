@@ -151,7 +151,8 @@ def test_trains_may_stand_in_additional_files_alone(folder):
 
 def test_what_is_not_followed_is_in_the_events_and_on_the_page(folder):
     found = followed(folder, nets.train("v", "ab", 0, flavour="sweet"), 20, "", ("numeric",))
-    [said] = events(found, "not_followed")
+    said, cruise = events(found, "not_followed")
+    assert cruise["what"] == "1 trains could run up to 40 m/s by their types and tracks: they cruise at reference.speed_mps = 35"
     assert said["what"] == "1 x <vehicle flavour>: not followed: it is not known here"
     from trainctl.report.page import page
 

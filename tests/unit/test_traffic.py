@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 import subprocess
 import sys
 from itertools import pairwise
@@ -111,6 +112,32 @@ def test_the_same_seed_draws_the_same(files: Files) -> None:
     assert {d.kind for d in one.departures} == {"m1", "m2", "t"} == set(one.kinds)
     assert {d.edges for d in one.departures} == {("ab", "bc", "cd"), ("xb", "bc")}
     assert 80 < sum(d.id.startswith("f.") for d in one.departures) < 160  # 120 expected
+
+
+def test_what_is_random_of_a_train_is_drawn_for_each_by_its_name(files: Files) -> None:
+    said = 'departPos="random" departSpeed="random" arrivalPos="random" departEdge="random" arrivalEdge="random"'
+    vehicles = [f'<vehicle id="v{k}" type="t" depart="{k}" route="main" {said}/>' for k in range(60)]
+    one = {d.id: d for d in files.read("".join(vehicles)).departures}
+    few = files.read("".join(vehicles[7:9])).departures
+    assert [one[d.id] for d in few] == list(few)  # whoever else there is
+    length = {"ab": 2000.0, "bc": 2000.0, "cd": 3000.0}
+    assert all(0.0 <= d.position_m <= length[d.edges[0]] and 0.0 <= d.arrival_m <= length[d.edges[-1]] for d in one.values())
+    depth = sorted(d.position_m / length[d.edges[0]] for d in one.values())
+    speeds = sorted(d.speed_mps for d in one.values())
+    assert depth[15] < 0.4 and depth[45] > 0.6 and speeds[0] < 7.0 and 29.0 < speeds[-1] < 36.0  # 0.9 x 40 m/s
+    assert {d.edges for d in one.values()} == {("ab", "bc", "cd"), ("ab", "bc"), ("ab",), ("bc", "cd"), ("bc",), ("cd",)}
+    assert read_traffic(files.sumocfg, files.folder / "work", seed=7).departures != few
+
+
+@pytest.mark.parametrize("scale", [0.3, 0.75, 1.5, 2.25])
+def test_a_fraction_of_the_trains_comes_that_comes_in_sumo(files: Files, scale: float) -> None:
+    files.write("".join(f'<vehicle id="v{k}" type="t" depart="{10 * k}" route="main"/>' for k in range(12)))
+    files.sumocfg.write_text(files.sumocfg.read_text().replace("<time>", f'<scale value="{scale}"/><time>'))
+    sumo, environment = program("sumo")
+    options = ["--no-step-log", "--insertion-checks", "none", "--tripinfo-output", "t.xml"]
+    subprocess.run([sumo, "-c", "run.sumocfg", *options], cwd=files.folder, env=environment, check=True, capture_output=True)
+    theirs = set(re.findall(r'tripinfo id="([^"]*)"', (files.folder / "t.xml").read_text()))
+    assert {d.id for d in read_traffic(files.sumocfg, files.folder / "work").departures} == theirs
 
 
 def test_trips_become_the_routes_of_sumo(files: Files) -> None:
@@ -237,7 +264,7 @@ def test_what_is_not_followed_is_told(files: Files) -> None:
         "1 definitions of persons left out",
         "1 definitions of containers left out",
         "2 vehicles, trips and flows left out: not rail",
-        'departPos="random": the train begins with its rear at the beginning of the edge, as with "base"',
+        '1 x departPos="random": drawn here, with other numbers than SUMO\'s',
         "vType loose: speedFactor = normc(0.8,0.1,0.2,1): its mean 0.8 for every train",
         "option step-length = 0.5: not followed: the step is run.step_s of the scenario",
         "1 x <vehicle arrivalSpeed>: not followed: trains leave as fast as they come",

@@ -181,7 +181,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         cooperates=together,
         vclass=tuple(traffic.kinds[d.kind].vclass for d in departures),
         patience=traffic.patience_s,
-        notes=traffic.notes,
+        notes=(*traffic.notes, *_slower(scenario, traffic, rails, routes)),
         rails=rails,
         placed=False,
     )
@@ -243,6 +243,25 @@ def _stops(departure: Departure, rails: Rails, way: Ints, begin: Floats, begin_s
             Stop(float(begin[row] + stop.position_m), stop.duration_s, until, stop.name or stop.edge, stop.pass_mps, stop.parks)
         )
     return tuple(found)
+
+
+def _slower(scenario: Scenario, traffic: Configuration, rails: Rails, routes: list[tuple[str, ...]]) -> list[str]:
+    """What the scenario's cruising speed keeps trains from that their files let run faster; SUMO's own drive by the files alone."""
+    cruise = scenario.reference.speed_mps
+    if cruise is None or scenario.controller.law == "sumo":
+        return []
+    limit = dict(zip(rails.edges, rails.speed_mps.tolist(), strict=True))
+    fastest = [
+        min(kind.max_speed_mps, min(kind.speed_factor, 1.0) * max(limit[e] for e in route))
+        for kind, route in zip((traffic.kinds[d.kind] for d in traffic.departures), routes, strict=True)
+    ]
+    slowed = [v for v in fastest if v > cruise]
+    if not slowed:
+        return []
+    return [
+        f"{len(slowed)} trains could run up to {max(slowed):.4g} m/s by their types and tracks: they cruise at"
+        f" reference.speed_mps = {cruise:g}"
+    ]
 
 
 def _before_the_end(stops: tuple[Stop, ...], end: float) -> tuple[Stop, ...]:
