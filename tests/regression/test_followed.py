@@ -196,3 +196,30 @@ def test_a_run_goes_on_from_a_checkpoint_while_a_train_is_parked(folder):
     again, since = resume(folder / "cut")
     assert since == 250.0
     assert again.trains.equals(whole.trains) and again.events == whole.events
+
+
+ADDITIONAL = '<additional-files value="s.add.xml"/>'
+SIGN = '<variableSpeedSign id="s" lanes="bc_0"><step time="100" speed="10"/><step time="300" speed="-1"/></variableSpeedSign>'
+
+
+def test_variable_speed_signs_are_kept_to_from_their_time_on(folder):
+    """One train is on the edge when the limit falls, the other comes later; both have slowed down in time."""
+    (folder / "s.add.xml").write_text(f"<additional>{SIGN}</additional>")
+    found = followed(folder, nets.train("x", "ab bc cd", 0) + nets.train("y", "ab bc cd", 90), 500, ADDITIONAL)
+    on, t = found.trains.edge.astype(str) == "bc", found.trains.time_s
+    while_low = found.trains[on & (t >= 100.0) & (t < 300.0)]
+    assert while_low.speed_mps.max() <= 10.0 + 1e-9 and {"x", "y"} == set(while_low.train.astype(str))
+    assert found.trains[on & (t > 330.0)].speed_mps.max() > 15.0
+    assert not any(e["emergency"] for e in events(found, "supervisor"))
+    arrived = {e["train"]: e["time_s"] for e in events(found, "arrive")}
+    for row in plain(folder, "tripinfo", "--railsignal-moving-block"):
+        assert arrived[row["id"]] == pytest.approx(float(row["arrival"]), rel=0.15)
+
+
+def test_a_train_does_not_enter_faster_than_a_sign_will_let_it(folder):
+    (folder / "steps.xml").write_text('<vss><step time="5" speed="5"/></vss>')
+    sign = '<variableSpeedSign id="s" lanes="ab_0" file="steps.xml"/>'
+    (folder / "s.add.xml").write_text(f"<additional>{sign}</additional>")
+    found = followed(folder, sign + nets.train("x", "ab bc", 0, departSpeed="avg"), 30, ADDITIONAL, ("numeric",))
+    assert "1 x <variableSpeedSign> in route files: not followed" in events(found, "not_followed")[0]["what"]
+    assert events(found, "depart")[0]["speed_mps"] < 8.0

@@ -18,7 +18,7 @@ import numpy as np
 
 from trainctl.davis import resistance
 from trainctl.plants import disturbance, shared
-from trainctl.railway import along, authority, supervisor
+from trainctl.railway import along, authority, signs, supervisor
 from trainctl.railway.supervisor import Assumed
 from trainctl.railway.ways import ways
 from trainctl.signals import GRAVITY, POSITION, SPEED, Floats
@@ -56,7 +56,7 @@ def top_speed(p: Model) -> Floats:
     if p.placed:
         highest: Floats = np.maximum(float(p.line.speed_mps.max()), start)
         return highest
-    limit, index = p.rails.speed_mps, p.line.index
+    limit, index = signs.highest(p.signs, p.rails.speed_mps), p.line.index
     routes = [float(limit[[index[e] for e in route]].max()) for route in p.roster.routes]
     highest = np.array(routes) if not p.scenario.event else np.full(len(routes), limit.max())  # a reroute may lead anywhere
     found: Floats = np.maximum(p.roster.speed_factor * highest, start)

@@ -51,6 +51,7 @@ class Roster(NamedTuple):
     vclass: tuple[str, ...]
     patience: float  # s, who cannot enter for longer does not come; inf: all come
     notes: tuple[str, ...]  # what of the configuration is not followed
+    signs: tuple[tuple[float, str, float], ...]  # variable speed signs: from when on [s], edge, limit [m/s]
     rails: Rails
     placed: bool  # by [[train]] tables, all there from the start; else they come and go
 
@@ -64,7 +65,7 @@ def placed(scenario: Scenario, line: Line) -> Roster:
         arrival=np.full(n, np.inf), speed=np.array([t.speed_mps for t in scenario.train], float), like=("",) * n,
         top_speed=np.full(n, np.inf), speed_factor=np.ones(n),
         routes=tuple(line.route(t.track, t.position_m) for t in scenario.train), stops=((),) * n, cooperates=np.ones(n, bool),
-        vclass=("rail",) * n, patience=np.inf, notes=(), rails=Rails.of(line), placed=True,
+        vclass=("rail",) * n, patience=np.inf, notes=(), signs=(), rails=Rails.of(line), placed=True,
     )  # fmt: skip
 
 
@@ -90,6 +91,7 @@ def from_tables(data: Mapping[str, Any], net: Path) -> Roster:
         vclass=tuple(data["vclass"]),
         patience=float(data["patience"]),
         notes=tuple(data["notes"]),
+        signs=tuple((float(t), str(edge), float(v)) for t, edge, v in data["signs"]),
         rails=Rails.read(net, {e for route in data["routes"] for e in route}),
         placed=False,
     )
@@ -182,6 +184,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         vclass=tuple(traffic.kinds[d.kind].vclass for d in departures),
         patience=traffic.patience_s,
         notes=(*traffic.notes, *_slower(scenario, traffic, rails, routes)),
+        signs=tuple((t - traffic.begin_s, edge, v) for t, edge, v in traffic.signs),
         rails=rails,
         placed=False,
     )

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trainctl.monitors import waiting
-from trainctl.railway import along, authority, interlocking, supervisor
+from trainctl.railway import along, authority, interlocking, signs, supervisor
 from trainctl.railway.authority import DRIVER_MARGIN_M, View
 from trainctl.railway.interlocking import Held
 from trainctl.railway.ways import Ways
@@ -81,6 +81,7 @@ class Traffic:
         )
         self.requesting = np.minimum(p.assumed.braking, planned)  # what is requested for, and braked with at least
         self.ways: Ways | None = None
+        self._limits(0.0)
 
     def initial(self) -> State:
         """Before the run: trains that are placed have come."""
@@ -101,6 +102,7 @@ class Traffic:
         s = self.arrivals(t, seen, s)
         if not self.looks:
             return s, nothing(len(speed))
+        self._limits(t)
         for i in [] if s.came.all() else np.flatnonzero(~s.came & self._given_up(t) & ~self._given_up(t - self.step_s)).tolist():
             self.journal.event(t, "given_up", train=self.p.scenario.ids[i], planned_s=float(self.roster.depart[i]))
         s, stops, soon = self._stops(t, seen, speed, overrun, s)
@@ -174,7 +176,7 @@ class Traffic:
     def _entering_speed(self, i: int, ways: Ways, here: Seen, speed: Floats, view: View, s: State) -> float | None:
         """Speed with which a train can enter safely; None if it has to wait. ``view`` is that with the train at its place."""
         rules, v, roster = self.rules, self.roster.speed[i], self.roster
-        limit = float(roster.speed_factor[i] * self.p.rails.speed_mps[roster.edge[i]])
+        limit = float(roster.speed_factor[i] * self.limit[roster.edge[i]])
         on_edge = limit - self.p.driving.below_limit_mps
         wanted = float(min(self.p.cruise[i], max(on_edge, 0.0)) if np.isnan(v) else min(v, limit))
         there = np.flatnonzero(here.present & (here.edge == roster.edge[i]) & (np.arange(len(speed)) != i))
@@ -286,6 +288,12 @@ class Traffic:
 
     # Turns, and what is ahead
 
+    def _limits(self, t: float) -> None:
+        """Limit of every edge (E,) [m/s] that is to be kept over the coming step."""
+        # A limit that falls while a train comes near asks for more than either alone: half the braking is kept for the way there.
+        rate = 0.5 * float(np.min(self.requesting, initial=np.inf))
+        self.limit = signs.announced(self.p.signs, self.p.rails.speed_mps, t, self.step_s, rate)
+
     def _reach(self, speed: Floats) -> Floats:
         """How far ahead every train requests [m]: farther than it would brake for what it must not enter."""
         assumed, rules = self.p.assumed, self.p.supervision
@@ -318,6 +326,6 @@ class Traffic:
         if self.p.driven:
             horizon = max(horizon, self.p.driving.join_range_m)
         return authority.look(
-            ways, self.net, self.p.rails.speed_mps, self.roster.speed_factor, seen.row, seen.position, speed, self.length,
+            ways, self.net, self.limit, self.roster.speed_factor, seen.row, seen.position, speed, self.length,
             seen.present, horizon, held.room, interlocking.order(s.requests),
         )  # fmt: skip

@@ -58,7 +58,7 @@ def not_followed(
     stops = {place for t in (*trains, *given) for s in t.iter("stop") for tag in PLACES for place in (s.get(tag),) if place}
     places = [e for name, e in elements.places.items() if name in stops]
     notes, refused = known.of_trains([*trains, *given, *types, *places])
-    return [*known.of_options(options), *notes, *known.of_others(elements.others), *known.of_net(net)], refused
+    return [*known.of_options(options), *notes, *known.of_others(elements.others, elements.unread), *known.of_net(net)], refused
 
 
 def refuse(sumocfg: Path, net: Path, trains: list[Element], elements: Elements, kinds: dict[str, Kind], tracks: Tracks) -> None:

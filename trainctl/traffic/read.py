@@ -34,6 +34,7 @@ from trainctl.traffic.files import (
 from trainctl.traffic.kinds import Kind, default_types, kind_of
 from trainctl.traffic.places import YES, Tracks, off_route, place_of, read_tracks, unconnected, unmarked
 from trainctl.traffic.scale import scaled
+from trainctl.traffic.speed_signs import Change, speed_signs
 from trainctl.traffic.trial import in_doubt, tried
 
 #: What SUMO takes in place of a number; the first is its default.
@@ -89,6 +90,7 @@ class Configuration(NamedTuple):
     step_s: float
     patience_s: float  # after this time trains that could not enter do not come any more; inf: they always do
     notes: tuple[str, ...]  # what is not followed
+    signs: tuple[Change, ...]  # variable speed signs
 
 
 def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, seed: int = 42) -> Configuration:
@@ -134,7 +136,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
     begin, own_end = times["begin"], times["end"] if times["end"] >= 0 else None
     ends = [e for e in (own_end, None if duration_s is None else begin + duration_s) if e is not None]
     tracks = read_tracks(net[0])
-    elements = read_demand([*more, *routes])
+    elements = read_demand(more, routes)
     if options.get("use-stop-ended", "false").lower() in YES:
         _ended(elements)
     wrong = [
@@ -150,6 +152,9 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
     more_notes, refused = not_followed(options, trains, elements, kinds, tracks.file)
     if refused:
         raise InputError([f"{sumocfg}: {line}" for line in refused])
+    signs, wrong = speed_signs(elements.others, tracks)
+    if wrong:
+        raise InputError([f"{sumocfg}: {line}" for line in wrong])
     refuse(sumocfg, net[0], trains, elements, kinds, tracks)
     if float(scale) != 1.0:
         trains, scale_notes = scaled(trains, elements.trains, float(scale), options.get("scale-suffix", "."))
@@ -196,6 +201,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         step_s=times["step-length"],
         patience_s=seconds(patience) if seconds(patience) >= 0 else math.inf,
         notes=(*notes, *more_notes),
+        signs=tuple(signs),
     )
 
 
