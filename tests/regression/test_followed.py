@@ -223,3 +223,20 @@ def test_a_train_does_not_enter_faster_than_a_sign_will_let_it(folder):
     found = followed(folder, sign + nets.train("x", "ab bc", 0, departSpeed="avg"), 30, ADDITIONAL, ("numeric",))
     assert "1 x <variableSpeedSign> in route files: not followed" in events(found, "not_followed")[0]["what"]
     assert events(found, "depart")[0]["speed_mps"] < 8.0
+
+
+@pytest.mark.parametrize("lots", [1, 2])
+def test_who_finds_no_place_in_a_parking_area_waits_before_it(folder, lots):
+    area = f'<parkingArea id="p" lane="bc_0" startPos="500" endPos="1000" roadsideCapacity="{lots}"/>'
+    (folder / "s.add.xml").write_text(f"<additional>{area}</additional>")
+    stop = '<stop parkingArea="p" duration="200"/>'
+    body = nets.train("x", "ab bc cd", 0, stop) + nets.train("y", "ab bc cd", 90, stop) + nets.train("z", "ab bc cd", 150)
+    found = followed(folder, body, 900, ADDITIONAL)
+    reached = {e["train"]: e["time_s"] for e in events(found, "stop_reached")}
+    arrived = sorted((e["time_s"], e["train"]) for e in events(found, "arrive"))
+    left = {e["train"]: e["time_s"] for e in events(found, "stop_left")}
+    assert (reached["y"] > left["x"]) == (lots == 1)
+    rows = plain(folder, "tripinfo", "--railsignal-moving-block")
+    assert [name for _, name in arrived] == [row["id"] for row in sorted(rows, key=lambda row: float(row["arrival"]))]
+    at = found.trains[(found.trains.train.astype(str) == "y") & (found.trains.time_s == left["x"] - 10.0)].position_m
+    assert (at.iloc[0] == pytest.approx(3500.0, abs=2.5)) == (lots == 1)

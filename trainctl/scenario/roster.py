@@ -32,6 +32,8 @@ class Stop(NamedTuple):
     name: str
     passing: float = 0.0  # m/s, it does not stand but passes with at most this speed; 0: it stands
     parks: bool = False  # it leaves the track meanwhile, and others pass
+    lots: float = math.inf  # so many trains can park at the places of this name
+    waits_before: float = 0.0  # m, where a train waits that finds none
 
 
 class Roster(NamedTuple):
@@ -242,9 +244,9 @@ def _stops(departure: Departure, rails: Rails, way: Ints, begin: Floats, begin_s
             raise ValueError(f"stop on edge {stop.edge} at {stop.position_m:g} m: lies behind the departure or the stop before")
         row, last = row + int(ahead[0]), stop.position_m
         until = -math.inf if stop.until_s is None else stop.until_s - begin_s
-        found.append(
-            Stop(float(begin[row] + stop.position_m), stop.duration_s, until, stop.name or stop.edge, stop.pass_mps, stop.parks)
-        )
+        area = () if stop.area is None else (float(stop.area.lots), stop.area.depth_m)
+        place = float(begin[row] + stop.position_m)
+        found.append(Stop(place, stop.duration_s, until, stop.name or stop.edge, stop.pass_mps, stop.parks, *area))
     return tuple(found)
 
 

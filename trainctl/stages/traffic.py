@@ -233,6 +233,17 @@ class Traffic:
         stops, k = self.roster.stops[i], int(s.next_stop[i])
         return stops[k] if k < len(stops) else None
 
+    def _full(self, stop: Stop, s: State) -> bool:
+        """Whether a train that is to park at a stop finds no place."""
+        if not stop.parks or np.isinf(stop.lots):
+            return False
+        there = (self.stop_of(j, s) for j in np.flatnonzero(s.parked).tolist())
+        return sum(other is not None and other.name == stop.name for other in there) >= stop.lots
+
+    def _place(self, stop: Stop, s: State) -> float:
+        """Where a train that stops has to stand now [m]."""
+        return stop.place - (stop.waits_before if self._full(stop, s) else 0.0)
+
     def _further(self, stop: Stop, i: int) -> float:
         """How far behind a stop a train would come to a stand that passes it as fast as it may [m]; 0 if it is to stand there."""
         rate = np.minimum(self.rules.service_mps2, self.assumed.braking[i])
@@ -250,7 +261,7 @@ class Traffic:
         for i in np.flatnonzero(seen.present & (s.next_stop < self.stops_of)).tolist():
             stop = self.stop_of(i, s)
             assert stop is not None
-            room = stop.place - float(seen.position[i])
+            room = self._place(stop, s) - float(seen.position[i])
             if standing[i]:
                 if t < s.stands_until[i] - 1e-9 or s.parked[i]:
                     continue
@@ -261,7 +272,7 @@ class Traffic:
                 if stop is None:
                     s.stopping[i] = False
                     continue
-                room = stop.place - float(seen.position[i])
+                room = self._place(stop, s) - float(seen.position[i])
             while stop is not None and stop.passing and room <= 0.0:
                 self.journal.event(t, "waypoint", train=self.p.scenario.ids[i], stop=stop.name, speed_mps=float(speed[i]))
                 s.next_stop[i] += 1
@@ -270,7 +281,7 @@ class Traffic:
             if stop is None:
                 s.stopping[i] = False
                 continue
-            if not stop.passing and speed[i] < STANDS_MPS and room < STOP_BAND_M:
+            if not stop.passing and speed[i] < STANDS_MPS and room < STOP_BAND_M and not self._full(stop, s):
                 s.stands_until[i] = max(t + stop.duration, stop.until)
                 self.journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=room)
                 s.parked[i] = stop.parks

@@ -156,7 +156,7 @@ NAMED: Mapping[tuple[str, str], tuple[str, frozenset[str]] | Refused] = {
     ("stop", "onDemand"): ("nobody waits or boards; the train stops", OFF),
     ("stop", "index"): ("stops are made in the order of the file", _words("end fit")),
     ("stop", "extension"): ("nobody is waited for", OFF),
-    ("parkingArea", "roadsideCapacity"): ("there is room for everybody", frozenset()),
+    ("parkingArea", "roadsideCapacity"): ("trains park at its end, whichever place is free", _words("0 1")),
     ("parkingArea", "onRoad"): ("who stops there leaves the track", OFF),
     ("vType", "scale"): ("every train of it comes once", _words("1 1.0 1.00")),
     **{
@@ -242,7 +242,7 @@ def _of_one(element: Element) -> Iterator[tuple[str, str | Refused]]:
     tag = element.tag
     if tag == "param" or tag.startswith("carFollowing-"):
         return
-    if tag not in ELEMENTS:
+    if tag not in ELEMENTS and tag != "space":
         yield tag, UNKNOWN
         return
     for key, value in element.items():

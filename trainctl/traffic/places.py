@@ -39,6 +39,20 @@ class Place(NamedTuple):
     wrong: str  # why it cannot stop there, or ""
 
 
+class Area(NamedTuple):
+    """A parking area."""
+
+    lots: int  # how many trains find a place
+    depth_m: float  # who finds none waits this far before
+
+
+def area_of(element: Element, place: Place) -> Area:
+    """Of a parking area with its end at ``place``: whose capacity is not said has none beside the spaces it lists, as in SUMO."""
+    said, start = element.get("roadsideCapacity", "0"), element.get("startPos", "0")
+    lots = (int(said) if said.isdecimal() else 0) + len(list(element.iter("space")))
+    return Area(lots, max(place.position_m - (float(start) if is_number(start) else 0.0), 0.0))
+
+
 def read_tracks(net: Path) -> Tracks:
     """Lanes and connections of a net with rail edges."""
     try:

@@ -32,7 +32,7 @@ from trainctl.traffic.files import (
     seconds,
 )
 from trainctl.traffic.kinds import Kind, default_types, kind_of
-from trainctl.traffic.places import YES, Tracks, off_route, place_of, read_tracks, unconnected, unmarked
+from trainctl.traffic.places import YES, Area, Tracks, area_of, off_route, place_of, read_tracks, unconnected, unmarked
 from trainctl.traffic.scale import scaled
 from trainctl.traffic.speed_signs import Change, speed_signs
 from trainctl.traffic.trial import in_doubt, tried
@@ -62,6 +62,7 @@ class StopElement(NamedTuple):
     first: int  # number in the route of the earliest edge it may be on
     pass_mps: float  # it does not stand, but passes with at most this speed; 0: it stands
     parks: bool  # it leaves the track meanwhile
+    area: Area | None  # where others park too
 
 
 class Departure(NamedTuple):
@@ -284,6 +285,7 @@ def _departure(
             first=at,
             pass_mps=float(stop.get("speed", "0")),
             parks=stop.get("parking", "false").lower() in YES or stop.get("parkingArea") is not None,
+            area=area_of(elements.places[stop.get("parkingArea", "")], place) if stop.get("parkingArea") else None,
         )
         for stop, place, at in zip(vehicle.iter("stop"), places, firsts, strict=True)
     ]
