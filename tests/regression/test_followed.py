@@ -10,6 +10,7 @@ import pytest
 import tomli_w
 from beside import followed, plain
 
+from trainctl.metrics.traffic import metrics_of_fcd
 from trainctl.runner import resume, run
 from trainctl.runs.run import Run
 from trainctl.scenario.build import open_scenario
@@ -167,6 +168,16 @@ def test_a_train_that_parks_lets_others_pass(folder):
     arrived = {e["train"]: e["time_s"] for e in events(found, "arrive")}
     [left] = events(found, "stop_left")
     assert arrived["y"] < left["time_s"] < arrived["x"]
+    # SUMO's log has the parked train on its lane all the time.
+    assert metrics_of_fcd(found.folder / "sumo" / "fcd.parquet")["fcd.spacing_min_m"] > 100.0
+    assert found.metrics.get("traffic.gap_min_m", 1e9) > 0.0
+    logs = ("--fcd-output", "fcd.xml", "--railsignal-moving-block")
+    plain(folder, "stop", *logs)
+    beside = folder / "with"
+    beside.mkdir()
+    for name, other in (("fcd.xml", "fcd.xml"), ("plain.xml", "stop.xml")):
+        (beside / other).write_bytes((folder / name).read_bytes())
+    assert metrics_of_fcd(beside / "fcd.xml")["fcd.spacing_min_m"] > 100.0 > metrics_of_fcd(folder / "fcd.xml")["fcd.spacing_min_m"]
     assert (found.folder / "sumo" / "collisions.xml").read_text().count("<collision ") == 0
     sumo = {row["id"]: float(row["arrival"]) for row in plain(folder, "tripinfo", "--railsignal-moving-block")}
     assert sumo["y"] < sumo["x"]

@@ -283,7 +283,8 @@ class Traffic:
                 continue
             if not stop.passing and speed[i] < STANDS_MPS and room < STOP_BAND_M and not self._full(stop, s):
                 s.stands_until[i] = max(t + stop.duration, stop.until)
-                self.journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=room)
+                parks = {"parked": True} if stop.parks else {}
+                self.journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=room, **parks)
                 s.parked[i] = stop.parks
                 continue
             trains.append(i)
