@@ -37,7 +37,13 @@ if TYPE_CHECKING:
 @app.command()
 def run(
     name: ScenarioName = DEFAULT_SCENARIO,
-    out: Annotated[Path | None, typer.Option(help="Run folder; default runs/NAME. A run of ours there is replaced.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Run folder; default runs/NAME, with --set runs/NAME,KEY=VALUE. A run there is replaced, unless more than a run"
+            " lies there: then it goes to NAME-2."
+        ),
+    ] = None,
     backend: Annotated[Literal["sumo", "numeric"], typer.Option(help="SUMO, or the same loop without a simulator.")] = "sumo",
     gui: Annotated[bool, typer.Option("--gui", help="Watch the run in sumo-gui: tracks, trains by role, links.")] = False,
     gui_program: Annotated[str, typer.Option(help="The program --gui starts; sumo is the same without a window.")] = "sumo-gui",
@@ -59,13 +65,16 @@ def run(
     Exit 1 if trains collided or waited for each other in a circle; with the supervisor on also if one was too fast for its line.
     """
     from trainctl import runner
+    from trainctl.record.folder import place_for, run_name
 
     if gui and backend == "numeric":
         raise InputError("--gui: shows SUMO; leave out --backend numeric")
     if record_every is not None:
         settings = [*(settings or []), f"run.record_every_s={record_every!r}"]
     model = named(name, settings)
-    folder = out if out is not None else Path("runs") / Path(name).stem
+    folder, elsewhere = (out, "") if out is not None else place_for(Path("runs") / run_name(name, settings or []))
+    if elsewhere:
+        say(elsewhere, error=True)
     shown = not (quiet or as_json)
     with Progress(f"{Path(name).stem}", shown and sys.stderr.isatty()) as advance:
         done = runner.run(model, folder, backend, force, sys.argv, advance, gui_program if gui else None, checkpoint_every)
