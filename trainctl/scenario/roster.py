@@ -15,9 +15,12 @@ from sumo_net import Line, LineError, Rails
 from sumo_net.layout import Gradient
 from trainctl.errors import InputError
 from trainctl.scenario.tables import Scenario, TrafficTable, Train, TrainType
-from trainctl.scenario.train_types import train_type
+from trainctl.scenario.train_types import fitted, train_type
 from trainctl.signals import Bools, Floats, Ints
 from trainctl.traffic.read import Configuration, Departure, read_traffic
+
+#: Name of the [train_type] of all vTypes without data of their own.
+REST = "*"
 
 #: A train that stops at the end of its way stands this far before it [m]; nearer than 0.1 m it would have left.
 STANDS_SHORT_M = 0.2
@@ -185,7 +188,11 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         cooperates=together,
         vclass=tuple(traffic.kinds[d.kind].vclass for d in departures),
         patience=traffic.patience_s,
-        notes=(*traffic.notes, *_slower(scenario, traffic, rails, routes)),
+        notes=(
+            *traffic.notes,
+            *fitted(kind for name, kind in traffic.kinds.items() if name not in scenario.train_type),
+            *_slower(scenario, traffic, rails, routes),
+        ),
         signs=tuple((t - traffic.begin_s, edge, v) for t, edge, v in traffic.signs),
         rails=rails,
         placed=False,
@@ -217,10 +224,10 @@ def _events(scenario: Scenario, ids: list[str], rails: Rails) -> list[str]:
 
 def _types(scenario: Scenario, traffic: Configuration) -> tuple[dict[str, TrainType], list[str]]:
     """Data of every vType that runs: the scenario's own, else what the vType says of itself."""
-    types, found = dict(scenario.train_type), []
+    types, found = {name: kind for name, kind in scenario.train_type.items() if name != REST}, []
     for name in dict.fromkeys(d.kind for d in traffic.departures):
         if name not in types:
-            kind = train_type(traffic.kinds[name])
+            kind = train_type(traffic.kinds[name], scenario.train_type.get(REST))
             if isinstance(kind, list):
                 found += kind
             else:

@@ -11,13 +11,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import nets
+import numpy as np
 import pytest
 
 from sumo_net.build import program
 from trainctl.errors import InputError
 from trainctl.scenario.tables import TrainType
-from trainctl.scenario.train_types import train_type
-from trainctl.traffic.kinds import Kind
+from trainctl.scenario.train_types import fitted, train_type
+from trainctl.traffic.kinds import RAIL_MODEL, Kind
 from trainctl.traffic.read import Configuration, read_traffic
 
 NODES = """<nodes><node id="a" x="0" y="0"/><node id="b" x="2000" y="0"/><node id="c" x="4000" y="0"/><node id="d" x="7000" y="0"/>
@@ -474,10 +476,9 @@ def test_what_a_type_lacks_is_told_in_one_line() -> None:
         return train_type(Kind("ICE", "rail", 200.0, 80.0, 1.0, attributes))
 
     constants = "mass, maxPower, maxTraction, resCoef_constant, resCoef_linear, resCoef_quadratic"
-    cure = f'add [train_type.ICE] to the scenario, or carFollowModel="Rail" trainType="custom" with {constants} to the vType'
+    cure = f'add [train_type.ICE] or, for all such types, [train_type."*"] to the scenario, or carFollowModel="Rail" trainType="custom" with {constants} to the vType'
     assert said() == [f"vType ICE: {', '.join(f'no {key}' for key in constants.split(', '))}: {cure}"]
     lacking = "no maxPower, no maxTraction, no resCoef_constant, no resCoef_linear, no resCoef_quadratic"
-    assert said(carFollowModel="Rail", trainType="ICE3") == [f"vType ICE: {lacking} (SUMO has trainType ICE3 as tables): {cure}"]
     assert said(maxPower="1", mass="80000") == [f"vType ICE: {lacking}: {cure}"]  # no other model takes notice of maxPower
     whole = dict.fromkeys(constants.split(", "), "1") | {"carFollowModel": "Rail", "trainType": "custom"}
     assert isinstance(said(**whole), TrainType)
@@ -486,6 +487,52 @@ def test_what_a_type_lacks_is_told_in_one_line() -> None:
         "vType ICE: maxPower = -3: must be a number, not negative",
     ]
     assert said(**whole | {"mass": "0"}) == ["vType ICE: mass = 0: must be above 0"]
+
+
+TRAIN_TYPES = sorted(RAIL_MODEL.keys() - {"custom"})
+
+
+def test_train_types_of_sumo_move_as_in_sumo(tmp_path: Path) -> None:
+    """The acceleration of each, at full effort up to its maximum speed, is SUMO's within the error stated, and comes near it."""
+    nets.net(tmp_path, {"a": (0, 0), "b": (300000, 0)}, {"ab": ("a", "b", {"speed": 200})})
+    types = "".join(
+        f'<vType id="{t}" vClass="rail" carFollowModel="Rail" trainType="{t}" sigma="0" speedDev="0"/>' for t in TRAIN_TYPES
+    )
+    trains = "".join(
+        f'<vehicle id="{t}" type="{t}" depart="0" departSpeed="0" departPos="{1e4 * (k + 1)}" insertionChecks="none">'
+        '<route edges="ab"/></vehicle>'
+        for k, t in enumerate(TRAIN_TYPES)
+    )
+    nets.traffic(tmp_path, trains, types)
+    script = f"""libsumo.start(["sumo", "-c", "a.sumocfg", "--no-step-log", "--no-warnings", "--railsignal-moving-block"])
+names = {TRAIN_TYPES}
+libsumo.simulationStep()
+for _ in range(250):
+    out.append([libsumo.vehicle.getSpeed(name) for name in names])
+    libsumo.simulationStep()
+"""
+    speeds = np.array(in_sumo(tmp_path, script))
+    kinds = read_traffic(tmp_path / "a.sumocfg", tmp_path / "work").kinds
+    for k, name in enumerate(TRAIN_TYPES):
+        data, built = train_type(kinds[name]), RAIL_MODEL[name]
+        assert isinstance(data, TrainType)
+        v, gain = speeds[:-1, k], np.diff(speeds[:, k])
+        free = (v + gain < built.speed_mps - 0.01) & (gain > 0.0)
+        mass, factor = built.mass_kg, built.mass_factor
+        pull = np.minimum(data.traction_n, data.traction_power_w / np.maximum(v, 1e-9)) / mass
+        drag = data.c0_n_per_kg + data.c1_ns_per_m_kg * v + data.c2_ns2_per_m2_kg * v * v
+        error = float(np.max(np.abs((pull - drag) / factor - gain)[free]))
+        assert free.sum() > 30 and 0.3 * built.error_mps2 < error <= built.error_mps2, (name, error)
+    assert len(fitted(kinds.values())[0].split("within")) == len(TRAIN_TYPES) + 1
+
+
+def test_types_without_data_have_those_of_the_rest_with_what_they_state_themselves() -> None:
+    rest = TrainType(unit_length_m=50.0, units=2, unit_mass_kg=40e3, c0_n_per_kg=0.01, c1_ns_per_m_kg=0.0, c2_ns2_per_m2_kg=0.0)
+    plain = train_type(Kind("p", "rail", 90.0, 40.0, 1.0, {}), rest)
+    assert isinstance(plain, TrainType) and (plain.unit_length_m, plain.unit_mass_kg, plain.braking_n) == (45.0, 40e3, None)
+    heavy = train_type(Kind("h", "rail", 90.0, 40.0, 1.0, {"mass": "100000", "decel": "0.5"}), rest)
+    assert isinstance(heavy, TrainType) and heavy.unit_mass_kg == (50e3, 50e3) and heavy.braking_n == (25e3, 25e3)
+    assert train_type(Kind("w", "rail", 90.0, 40.0, 1.0, {"mass": "0"}), rest) == ["vType w: mass = 0: must be a number above 0"]
 
 
 @pytest.mark.parametrize("name", ["rail", "rail_demo"])
