@@ -23,6 +23,7 @@ from trainctl.cli.console import (
     listing,
     named,
     networks,
+    number,
     say,
     show,
     show_json,
@@ -110,11 +111,11 @@ def _summary(done: Run, model: Model) -> None:
         ("formation.final_error_m", "largest spacing error at the end", "m"),
     ):
         if isinstance(metrics.get(key), int | float):
-            fill(table, words, f"{metrics[key]:.6g} {unit}")
+            fill(table, words, f"{number(metrics[key])} {unit}")
     for line in summary(done):
         fill(table, line.title, f"FAILED: {line.text}" if line.failed else line.text)
-    fill(table, "results", f"{done.folder}/  (trainctl plot {done.folder}; trainctl metrics {done.folder})")
     show(table)
+    say(f"  results in {done.folder}/\n  trainctl plot {done.folder}\n  trainctl metrics {done.folder}\n")
     for note in model.roster.notes:
         say(f"warning: {note}")
 
@@ -170,6 +171,7 @@ def metrics(
     band_m: Annotated[float, typer.Option(help="Band for settling of spacings [m].")] = 1.0,
     section_m: Annotated[float | None, typer.Option(help="Kilometrage at which trains are counted [m].")] = None,
     everything: Annotated[bool, typer.Option("--all", help="Also the values of each train, link and unit.")] = False,
+    only: Annotated[str | None, typer.Option(help="Only metrics whose names begin like this: bounds, energy, traffic.gap.")] = None,
     names: Annotated[bool, typer.Option("--list", help="List all metrics with units and definitions.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -195,14 +197,24 @@ def metrics(
         from trainctl.metrics.traffic import metrics_of_fcd
 
         values = metrics_of_fcd(folder)
+    if only is not None:
+        kept = {key: value for key, value in values.items() if key.startswith(only)}
+        if not kept:
+            groups = dict.fromkeys(key.partition(".")[0] for key in values)
+            raise InputError(f"--only {only}: no metric begins like this; there are: {', '.join(groups)}")
+        values = kept
     if as_json:
         show_json(values)
         return
     table = listing(str(folder), "metric", "value", "unit")
+    group = ""
     for key, value in values.items():
         if everything or "/" not in key:
+            if group and group != key.partition(".")[0]:
+                table.add_section()
+            group = key.partition(".")[0]
             unit = measured.DEFINITIONS.get(key.partition("/")[0], ("", ""))[0]
-            fill(table, key, f"{value:.6g}" if isinstance(value, float) else str(value), unit)
+            fill(table, key, number(value), unit)
     show(table)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 import time
@@ -11,6 +12,8 @@ from pathlib import Path
 import pytest
 import tomli_w
 
+from trainctl.cli import console
+from trainctl.cli.console import number
 from trainctl.record.folder import run_name
 from trainctl.scenario.reading import read
 
@@ -158,3 +161,32 @@ def test_runs_are_named_by_their_settings():
     assert run_name("my", ["controller.law=../x.py", "train.1=[1, 2]"]) == "my,controller.law=..-x.py,train.1=[1-2]"
     long = [run_name("my", [f"bounds.speed_upper_mps={k}" * 9]) for k in (1, 2)]
     assert len(set(long)) == 2 and all(len(name) <= 120 for name in long)
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        (1234.5678, "1235"), (-1.4e-14, "0"), (0.00123456, "0.001235"), (123456.7, "123500"), (1e9, "1.000e+09"), (9.9996, "10"),
+        (2.5e-6, "2.500e-06"), (0.5, "0.5"), (3, "3"), (None, "-"), ("steps", "steps"), (math.inf, "inf"), (-0.25, "-0.25"),
+    ],
+)  # fmt: skip
+def test_numbers_are_short(value, shown):
+    assert number(value) == shown
+
+
+def test_metrics_come_in_groups_of_which_one_may_be_asked_for(folder):
+    asked = json.loads(typed("metrics", folder, "--only", "energy", "--json").stdout)
+    assert asked and all(key.startswith("energy.") for key in asked)
+    shown = typed("metrics", folder, "--only", "bounds").stdout
+    assert "bounds.broken" in shown and "energy" not in shown
+    wrong = typed("metrics", folder, "--only", "speed")
+    assert wrong.returncode == 2 and "there are: run, bounds," in wrong.stderr
+
+
+def test_scenarios_runs_and_keys_are_completed(folder, monkeypatch):
+    monkeypatch.chdir(folder.parents[1])
+    assert "robust_constrained" in console.scenario_names("ro") and "three_tracks" not in console.scenario_names("ro")
+    assert console.run_folders("runs/fu") == [str(folder.relative_to(folder.parents[1]))]
+    assert "topology.loss=" in console.settable("topology.l") and console.settable("x") == []
+    Path("my.toml").write_text("")
+    assert "my.toml" in console.scenario_names("m")
