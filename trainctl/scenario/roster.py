@@ -57,6 +57,7 @@ class Roster(NamedTuple):
     patience: float  # s, who cannot enter for longer does not come; inf: all come
     notes: tuple[str, ...]  # what of the configuration is not followed
     signs: tuple[tuple[float, str, float], ...]  # variable speed signs: from when on [s], edge, limit [m/s]
+    source: str  # the SUMO configuration; "" for [[train]] tables
     rails: Rails
     placed: bool  # by [[train]] tables, all there from the start; else they come and go
 
@@ -70,7 +71,7 @@ def placed(scenario: Scenario, line: Line) -> Roster:
         arrival=np.full(n, np.inf), speed=np.array([t.speed_mps for t in scenario.train], float), like=("",) * n,
         top_speed=np.full(n, np.inf), speed_factor=np.ones(n),
         routes=tuple(line.route(t.track, t.position_m) for t in scenario.train), stops=((),) * n, cooperates=np.ones(n, bool),
-        vclass=("rail",) * n, patience=np.inf, notes=(), signs=(), rails=Rails.of(line), placed=True,
+        vclass=("rail",) * n, patience=np.inf, notes=(), signs=(), source="", rails=Rails.of(line), placed=True,
     )  # fmt: skip
 
 
@@ -97,6 +98,7 @@ def from_tables(data: Mapping[str, Any], net: Path) -> Roster:
         patience=float(data["patience"]),
         notes=tuple(data["notes"]),
         signs=tuple((float(t), str(edge), float(v)) for t, edge, v in data["signs"]),
+        source=str(data["source"]),
         rails=Rails.read(net, {e for route in data["routes"] for e in route}),
         placed=False,
     )
@@ -188,11 +190,14 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         cooperates=together,
         vclass=tuple(traffic.kinds[d.kind].vclass for d in departures),
         patience=traffic.patience_s,
-        notes=(
+        notes=_changes(scenario, traffic)
+        if scenario.controller.law == "sumo"
+        else (
             *traffic.notes,
             *fitted(kind for name, kind in traffic.kinds.items() if name not in scenario.train_type),
             *_slower(scenario, traffic, rails, routes),
         ),
+        source=str((folder / str(scenario.network.sumocfg)).resolve()),
         signs=tuple((t - traffic.begin_s, edge, v) for t, edge, v in traffic.signs),
         rails=rails,
         placed=False,
@@ -257,10 +262,19 @@ def _stops(departure: Departure, rails: Rails, way: Ints, begin: Floats, begin_s
     return tuple(found)
 
 
+def _changes(scenario: Scenario, traffic: Configuration) -> tuple[str, ...]:
+    """What SUMO's own trains do otherwise than the files of their configuration say."""
+    step, block = scenario.run.step_s, scenario.controller.keys().get("block", "files")
+    found = [f"option step-length = {traffic.step_s:g}: run.step_s = {step:g} instead"] if traffic.step_s != step else []
+    if block != "files":
+        found.append(f"option railsignal-moving-block: controller.block = {block} instead")
+    return (*found, "options time-to-teleport and collision.action: trains are never teleported, none is removed that collides")
+
+
 def _slower(scenario: Scenario, traffic: Configuration, rails: Rails, routes: list[tuple[str, ...]]) -> list[str]:
-    """What the scenario's cruising speed keeps trains from that their files let run faster; SUMO's own drive by the files alone."""
+    """What the scenario's cruising speed keeps trains from that their files let run faster."""
     cruise = scenario.reference.speed_mps
-    if cruise is None or scenario.controller.law == "sumo":
+    if cruise is None:
         return []
     limit = dict(zip(rails.edges, rails.speed_mps.tolist(), strict=True))
     fastest = [
