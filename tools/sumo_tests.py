@@ -26,10 +26,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import re
 import subprocess
 import sys
 import tempfile
+import tomllib
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -131,6 +133,10 @@ def case(sumocfg: Path, base: Path) -> dict[str, Any]:
             return found | {"law": {"ran": f"exit 2: {why}"}, "baseline": {"ran": f"exit 2: {why}"}}
         begin = re.search(r'<(?:begin|b) (?:value|v)="([\d.]+)"', sumocfg.read_text(encoding="utf-8"))
         since = float(begin[1]) if begin else 0.0
+        end = max((t for t, _ in there.arrived), default=0.0) - since + 10.0
+        if end > tomllib.loads(scenario.read_text(encoding="utf-8"))["run"]["duration_s"]:  # SUMO itself is slower than thought
+            longer = re.sub(r"(?m)^duration_s = \d+", f"duration_s = {math.ceil(end)}", scenario.read_text(encoding="utf-8"))
+            scenario.write_text(longer, encoding="utf-8")
         found["law"] = compared(ours(scenario, work / "law"), there, since)
         found["baseline"] = compared(ours(scenario, work / "baseline", "--set", "controller.law=sumo"), there, since)
         return found

@@ -27,6 +27,9 @@ def rail_trains(elements: Elements, kinds: dict[str, Kind]) -> tuple[list[Elemen
     counts = Counter(PEOPLE[e.tag] for e in elements.others if e.tag in PEOPLE)
     notes = [f"{n} definitions of {word} left out" for word, n in counts.items() if n]
     notes += [f"{others} vehicles, trips and flows left out: not rail"] if others else []
+    if late := [train.get("id", "") for train in elements.late]:
+        some = f"{', '.join(late[:8])}{' ...' if len(late) > 8 else ''}"
+        notes.append(f"{len(late)} vehicles, trips and flows left out, as in SUMO: a route file goes by departure times: {some}")
     places = {t.get("departPos", "") for t in trains} & {"last", "splitFront"}
     notes += [
         f'departPos="{p}": the train begins with its rear at the beginning of the edge, as with "base"' for p in sorted(places)

@@ -39,6 +39,7 @@ class Elements(NamedTuple):
     places: dict[str, Element]
     others: list[Element]  # persons, rerouters and whatever else there is
     unread: list[Element]  # what SUMO reads in additional files alone, in a route file
+    late: list[Element]  # trains behind later ones in a route file, which SUMO passes over
 
 
 def parse(path: Path) -> Element:
@@ -73,14 +74,18 @@ def named_files(sumocfg: Path, options: dict[str, str], key: str) -> list[Path]:
 
 def read_demand(additional: list[Path], routes: list[Path]) -> Elements:
     """What additional files and route files say, with the files they include; a name may be given once."""
-    d = Elements({}, {}, {}, {}, [], {}, [], [])
+    d = Elements({}, {}, {}, {}, [], {}, [], [], [])
     named = {"vType": d.types, "vTypeDistribution": d.mixes, "route": d.routes, "routeDistribution": d.drawn}
     wrong = []
     for path in (*additional, *routes):
+        last = -math.inf
         for element in _elements(path):
             tag = element.tag
             if tag in _TRAINS:
-                d.trains.append(element)
+                depart = element.get("begin" if tag == "flow" else "depart", "0")
+                begins = seconds(depart) if is_time(depart) else -math.inf
+                (d.late if begins < last and path not in additional else d.trains).append(element)
+                last = max(last, begins)
             elif tag in named or tag in PLACES:
                 # The members of a distribution have a name of their own.
                 members = [e for e in element if tag in ("vTypeDistribution", "routeDistribution") and not e.get("refId")]

@@ -142,6 +142,22 @@ def test_a_fraction_of_the_trains_comes_that_comes_in_sumo(files: Files, scale: 
     assert {d.id for d in read_traffic(files.sumocfg, files.folder / "work").departures} == theirs
 
 
+def test_trains_out_of_order_in_a_route_file_do_not_come_as_in_sumo(files: Files) -> None:
+    def v(name: str, depart: float) -> str:
+        return f'<vehicle id="{name}" type="t" depart="{depart}" route="main"/>'
+
+    flow = '<flow id="f" type="t" begin="90" period="60" number="2" route="main"/>'
+    body = v("a", 40) + v("b", 0) + v("c", 60) + f'<trip id="d" type="t" depart="50" from="ab" to="cd"/>{v("e", 100)}{flow}'
+    traffic = files.read(body, stops=STOPS.replace("</additional>", f"{v('g', 30)}{v('h', 20)}</additional>"))
+    sumo, environment = program("sumo")
+    options = ["--no-step-log", "--insertion-checks", "none", "--tripinfo-output", "t.xml"]
+    subprocess.run([sumo, "-c", "run.sumocfg", *options], cwd=files.folder, env=environment, check=True, capture_output=True)
+    theirs = set(re.findall(r'tripinfo id="([^"]*)"', (files.folder / "t.xml").read_text()))
+    assert {d.id for d in traffic.departures} == theirs == set("aceg") | {"h"}
+    told = "3 vehicles, trips and flows left out, as in SUMO: a route file goes by departure times: b, d, f"
+    assert told in traffic.notes
+
+
 def test_trips_become_the_routes_of_sumo(files: Files) -> None:
     traffic = files.read('<trip id="a" type="t" depart="0:01:01.5" from="ab" via="bc" to="cd"/>'
                          '<trip id="b" type="t" depart="70" from="xb" to="cd"><stop trainStop="mid" duration="60"/></trip>')  # fmt: skip
