@@ -193,7 +193,7 @@ def test_a_train_that_is_late_in_two_logs_is_one_finding():
     two = compare(log(trips, **how), log(slow, **how), Tolerances(), {})
     (f,) = merged([f for t in (one, two) for f in causes(t, Tolerances())])
     assert (f.cause, f.trains, f.by, f.tables) == ("late", ["p"], 7.0, ["fcd", "tripinfo"])
-    assert f.words == "train p late by 7 s, as it stands on b from 61 s on"
+    assert f.words == "train p late by 7 s because it stands on b from 61 s on"
     assert f.first.place.time_s == pytest.approx(60.0, abs=1.0)
 
 
@@ -212,7 +212,7 @@ def test_noise_is_called_noise():
     b = a.assign(distance=a.distance + np.random.default_rng(0).uniform(-0.05, 0.05, len(a)))
     (f,) = found([a], [b])
     assert f.cause == "noise"
-    assert f.words.startswith("distance scatters within 0.05 of train p")
+    assert f.words.startswith("distance of train p scatters within 0.05")
     (g,) = found([a], [a.assign(distance=a.distance * 1.001 + 1e-4 * a.time**2)])
     assert g.cause == "values"
 

@@ -73,10 +73,26 @@ def test_only_a_complete_run_becomes_a_golden(run, tmp_path):
         make_golden(copy, tmp_path / "golden")
 
 
-def test_a_golden_replaces_runs_only(run, tmp_path):
+def test_a_golden_replaces_goldens_only(run, golden, tmp_path):
     (tmp_path / "thesis").mkdir()
-    with pytest.raises(InputError, match="not a run folder"):
-        make_golden(run, tmp_path / "thesis")
+    make_golden(run, tmp_path / "thesis")  # empty: nothing is lost
+    (tmp_path / "text").mkdir()
+    (tmp_path / "text" / "mine").touch()
+    with pytest.raises(InputError, match="text: is no golden"):
+        make_golden(run, tmp_path / "text")
+    whole = Path(shutil.copytree(run.folder, tmp_path / "whole"))
+    with pytest.raises(InputError, match="whole: is no golden"):
+        make_golden(golden, whole)  # exchanged: the run would be lost
+    assert assert_run_matches(whole, run.folder, EXACT).same
+
+
+def test_a_golden_that_fails_leaves_the_old_one(golden, tmp_path):
+    before = sorted(tmp_path.rglob("*"))
+    (tmp_path / "cut.xml").write_text('<fcd-export><timestep time="0"><vehicle id="a" speed="1"/>')
+    for place in (golden, tmp_path / "new"):
+        with pytest.raises(InputError, match="not well-formed"):
+            make_golden(tmp_path / "cut.xml", place)
+    assert sorted(tmp_path.rglob("*")) == sorted([*before, tmp_path / "cut.xml"])
 
 
 def test_streams_are_read_in_step(monkeypatch):

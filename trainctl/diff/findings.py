@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from trainctl.diff.rows import Place
+from trainctl.errors import printable
 
 #: What a finding can say.
 CAUSES = {
@@ -47,8 +48,8 @@ UNITS = {
     0.3048: "ft -> m", 3.280839895: "m -> ft",
 }  # fmt: skip
 
-#: Trains that are named in a finding's words.
-NAMED = 4
+#: Trains that are named in a finding's words, and letters of each name.
+NAMED, LETTERS = 4, 60
 
 
 @dataclass
@@ -91,23 +92,29 @@ class Finding:
     def where(self) -> str:
         """The tables and how much they hold of it, in words."""
         parts = [", ".join(self.tables)]
-        parts += [_number(self.values, "value")] * (self.values > 0) + [_number(self.rows, "row")] * (self.rows > 0)
+        parts += [counted(self.values, "value")] * (self.values > 0) + [counted(self.rows, "row")] * (self.rows > 0)
         return ": ".join(parts[:1]) + (f" ({', '.join(parts[1:])})" if parts[1:] else "")
 
 
 def named(trains: Iterable[str], key: str = "train") -> str:
     """Trains in words."""
-    every = list(trains)
-    if every == [""]:
+    if not key:  # the only row
         return ""
+    every = list(trains)
+    names = ", ".join(short(name) for name in every[:NAMED])
     if len(every) > NAMED:
-        return f"{len(every)} trains ({', '.join(every[:NAMED])}, ...)"
-    return (
-        f"{'train' if len(every) == 1 else 'trains'} {', '.join(every)}" if key in ("id", "train", "sender") else ", ".join(every)
-    )
+        return f"{len(every)} trains ({names}, ...)"
+    return f"{'train' if len(every) == 1 else 'trains'} {names}" if key in ("id", "train", "sender") else names
 
 
-def _number(count: int, what: str) -> str:
+def short(name: str) -> str:
+    """A name, or whatever stands in a log, as a part of a line."""
+    text = printable(name[: LETTERS + 1]) or '""'
+    return text if len(text) <= LETTERS else f"{text[: LETTERS - 3]}..."
+
+
+def counted(count: int, what: str) -> str:
+    """A number of things in words."""
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
