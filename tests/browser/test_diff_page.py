@@ -48,6 +48,18 @@ def test_no_console_error_no_request_and_every_curve(written, dark, tmp_path):
         browser.screenshot(tmp_path / "page.png")
 
 
+def test_numbers_stay_readable_on_a_small_screen(written):
+    with Browser(width=500) as browser:
+        browser.open(written / "page.html")
+        browser.until("return document.documentElement.dataset.ready === 'yes'")
+        assert browser.run("return document.documentElement.scrollWidth <= window.innerWidth")
+        sizes = browser.run(
+            "return [...document.querySelectorAll('svg')].map(s => s.getBoundingClientRect().width / s.viewBox.baseVal.width)"
+        )
+        assert sizes
+        assert min(sizes) * 11 > 8.5  # letters [px]
+
+
 def test_the_cursor_says_both_values_and_the_tube(written):
     with Browser() as browser:
         browser.open(written / "page.html")

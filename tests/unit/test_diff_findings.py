@@ -193,8 +193,20 @@ def test_a_train_that_is_late_in_two_logs_is_one_finding():
     two = compare(log(trips, **how), log(slow, **how), Tolerances(), {})
     (f,) = merged([f for t in (one, two) for f in causes(t, Tolerances())])
     assert (f.cause, f.trains, f.by, f.tables) == ("late", ["p"], 7.0, ["fcd", "tripinfo"])
-    assert f.words == "train p late by 7 s because it stands on b from 61 s on"
+    assert f.words == "train p late by 7 s from 61 s on: it stands on b"
     assert f.first.place.time_s == pytest.approx(60.0, abs=1.0)
+
+
+@pytest.mark.parametrize("others", [[], ["q"], ["q", "r"]])
+def test_a_train_at_a_steady_speed_is_late_and_its_place_is_not_shifted(others):
+    rest = [course(name, ["d", "e"], begin=7) for name in others]
+    a = course("p", ["a", "b", "c"])
+    b = a.copy()
+    b.loc[b.time >= 60, ["pos", "distance", "lane"]] = a.loc[a.time.between(57, 196), ["pos", "distance", "lane"]].to_numpy()
+    (f,) = found([a, *rest], [b, *rest])
+    assert (f.cause, f.words) == ("late", "train p late by 3 s from 60 s on")
+    (f,) = found([a, *rest], [a.assign(distance=a.distance + 4.0), *rest])
+    assert (f.cause, f.by) == ("shift", 4.0)
 
 
 def test_other_routes_of_several_trains():

@@ -165,6 +165,8 @@ def _constant(todo: _Open, name: str, most: bool = True) -> Finding | None:
     own = [int(k) for k in trains[agreed]]
     first = float(f["first_s"][agreed].min()) if t.time is not None else None
     every = count == len(np.intersect1d(t.all_a.trains(), t.all_b.trains()))
+    if most and name in PLACES and (count == 1 or not every):
+        return None  # of a train at a steady speed the place is shifted if it is late
     who = "" if every or not t.keys else f" of {named((t.trains[k] for k in own), _key(t))}"
     side = "shift" if cause == "shift" else "scale"
     low_, high_ = float(f[f"{side}_low"][agreed].max()), float(f[f"{side}_high"][agreed].min())
@@ -397,11 +399,12 @@ def _late(todo: _Open, kept: Kept, shifts: dict[int, Shift]) -> list[Finding]:
         who, by, at = named([t.trains[train]], _key(t)), abs(found.by_s), found.from_s
         a, b = kept.pairs(train)[0]
         cause, words = ("late", f"{who} late by {seconds(by)}") if found.by_s > 0 else ("early", f"{who} early by {seconds(by)}")
+        why = ""
         if found.by_s < 0 and stood(a, at, at + by) and not stood(b, at, at + by):
             cause, words = "stop", f"{who} leaves out a stop of {seconds(by)}{_at(a, at, kept)}, and is early by that"
         elif found.by_s > 0 and stood(b, at, at + by) and not stood(a, at, at + by):
-            words += f" because it stands{_at(b, at, kept)}"
-        out.append(todo.close(cause, words + since(at), [train], found.columns, True, from_s=at, by=by))
+            why = f": it stands{_at(b, at, kept)}"
+        out.append(todo.close(cause, words + since(at) + why, [train], found.columns, True, from_s=at, by=by))
     return out
 
 
