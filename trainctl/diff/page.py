@@ -60,8 +60,9 @@ def _page(report: Report) -> str:
         data.append(values)
     body = "".join(_finding(f, n, shown.get(id(f), [])) for n, f in enumerate(report.findings, 1))
     rows = sum(t.rows for t in report.tables)
+    names = escape(", ".join(t.table for t in report.tables))
     verdict = (
-        f'<p class="verdict held">No difference in {counted(rows, "row")} of {escape(", ".join(t.table for t in report.tables))}.</p>'
+        f'<p class="verdict held">No difference in {counted(rows, "row")} of {names}.</p>'
         if report.same
         else f'<p class="verdict broken">{counted(len(report.findings), "finding")} in {rows} compared rows. '
         f"First: {escape(report.first or '')}</p>"
