@@ -169,7 +169,7 @@ def test_another_way_is_one_finding():
     b[0].loc[b[0].lane == "siding_0", "speed"] = 11.0
     (f,) = found(a, b)
     assert (f.cause, f.trains) == ("route", ["p"])
-    assert f.words == "train p takes another way from 50 s on: siding east instead of left east"
+    assert f.words == "train p takes another route from 50 s on: siding east instead of left east"
 
 
 def test_another_track_of_the_same_way():
@@ -216,7 +216,7 @@ def test_other_routes_of_several_trains():
     a = pd.DataFrame({"id": list("pqr"), "depart": [0.0, 1.0, 2.0], "route_edges": ["a b c", "a b d", "a b e"]})
     b = a.assign(route_edges=["a b c", "a x d", "a b f e"])
     told = [f.words for f in causes(compare(log(a, **how), log(b, **how), Tolerances(), {}), Tolerances())]
-    assert told == ["train q takes another way: x d instead of b d", "train r takes another way: f e instead of e"]
+    assert told == ["train q takes another route: x d instead of b d", "train r takes another route: f e instead of e"]
 
 
 def test_noise_is_called_noise():
@@ -233,7 +233,7 @@ def test_a_log_that_ends_before_is_one_finding():
     a = [course(name, ["a", "b"], begin=k) for k, name in enumerate("pqrs")]
     (f,) = found(a, [rows[rows.time < 150] for rows in a])
     assert (f.cause, f.rows, f.from_s) == ("ends", 4 * 50 + 6, 149.0)
-    assert f.words == "the log ends before the reference does: at 149 s instead of 202 s"
+    assert f.words == "the log ends earlier than the reference: at 149 s instead of 202 s"
 
 
 def test_a_train_that_is_missing_and_one_that_is_new():

@@ -13,6 +13,7 @@ import mutations
 import numpy as np
 import pytest
 
+import trainctl.diff
 import trainctl.testing
 from trainctl.diff.golden import accept, make_golden
 from trainctl.diff.page import page
@@ -218,6 +219,23 @@ def test_a_tolerance_in_time_lets_a_late_train_pass(typed, finished, tmp_path):
     assert typed("diff", a, b)[0] == 1
     assert typed("diff", a, b, "--time-tolerance", "1")[0] == 1
     assert typed("diff", a, b, "--time-tolerance", "2")[0] == 0
+
+
+def test_the_example_of_the_page_is_what_is_printed(finished, tmp_path, monkeypatch, capsys):
+    from trainctl.cli import program as cli
+
+    frame = mutations.read(finished("merging").folder)
+    rows = frame[frame.id == "fast.1"]
+    late = mutations.later(rows, rows.time.iloc[100], 20.0, True)
+    other = mutations.ordered([frame[~frame.id.isin(["fast.1", "fast.2"])], late], frame.time.max())
+    a, b = mutations.write(frame, tmp_path / "a.xml"), mutations.write(other, tmp_path / "b.xml")
+    (tmp_path / "t.toml").write_text("absolute = 1.0\ntime_s = 5.0\n")
+    monkeypatch.setattr("sys.argv", ["trainctl", "diff", str(a), str(b), "--tolerances", str(tmp_path / "t.toml")])
+    with pytest.raises(SystemExit):
+        cli.main()
+    page = (Path(trainctl.diff.__file__).parent / "README.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```text\n(.*?)```", page, re.S)
+    assert capsys.readouterr().out == example
 
 
 # Accepting and goldens

@@ -54,10 +54,10 @@ def register(app: typer.Typer) -> None:
         html: Html = None,
         accept: Annotated[bool, typer.Option("--accept", help="Put B in the place of A, after showing what moves.")] = False,
     ) -> None:
-        """Compare two runs or two of SUMO's logs (XML, CSV, Parquet, gzipped or not): exit 1 if they differ.
+        """Compare two runs or two of SUMO's logs (XML and CSV, gzipped or not, and Parquet): exit 1 if they differ.
 
         Differences are grouped by train and cause. Rows are matched by time and train; with a tolerance in time a value must lie in
-        the tube round the reference. Versions are told but are no difference; SUMO's headers, clocks and durations are not
+        the tube round the reference. Versions are noted but are no difference; SUMO's headers, clocks and durations are not
         compared. Without options values may differ by 1e-6, or by one in the last decimal of a log.
         """
         chosen = chosen_tolerances(tolerances, tolerance, time_tolerance, zero)

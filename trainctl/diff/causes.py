@@ -203,14 +203,14 @@ def _ends(todo: _Open) -> list[Finding]:
     if t.time is None or not len(t.all_a.trains()) or not len(t.all_b.trains()):
         return []
     for only, other, name, verb in (
-        (todo.only_a, t.all_b, "only_a", "ends before"), (todo.only_b, t.all_a, "only_b", "goes on after"),
+        (todo.only_a, t.all_b, "only_a", "ends earlier than"), (todo.only_b, t.all_a, "only_b", "ends later than"),
     ):  # fmt: skip
         presence = t.only_a if name == "only_a" else t.only_b
         end = float(other.figures["last_s"].max())
         late = [k for k in sorted(only) if presence.of("first_s", k) > end and not presence.of("doubled", k)]
         if late:
             last = max(presence.of("last_s", k) for k in late)
-            words = f"the log {verb} the reference does: at {seconds(end if name == 'only_a' else last)} instead of "
+            words = f"the log {verb} the reference: at {seconds(end if name == 'only_a' else last)} instead of "
             f = Finding(
                 "ends", words + seconds(last if name == "only_a" else end), [t.trains[k] for k in late], [t.table], from_s=end
             )
@@ -257,7 +257,7 @@ def _trips(todo: _Open, trains: list[int]) -> list[Finding]:
         routes = {name for name in own if name.startswith("route") and name.endswith("edges")}
         if routes:
             a, b = (str(text or "").split() for text in t.tallies[min(routes)].texts.get(train, ("", "")))
-            out.append(todo.close("route", f"{who} takes another way: {_instead(a, b)}", [train], routes, False))
+            out.append(todo.close("route", f"{who} takes another route: {_instead(a, b)}", [train], routes, False))
         times = own & TRIP_TIMES
         gaps = {name: _difference(t, name, train, "most").place for name in times if t.tallies[name].numbers}
         late = {name: (p.b - p.a) for name, p in gaps.items() if isinstance(p.a, float) and isinstance(p.b, float)}
@@ -292,7 +292,7 @@ def _ways(todo: _Open, kept: Kept, trains: list[int]) -> list[Finding]:
             # where both have the same edges the other log may only have ended before
             if strange and (left or strange[0][1] <= a.time[-1]):
                 at = min(time for _, time in [*strange[:1], *left[:1]])
-                what = "another track" if tracks else "another way"
+                what = "another track" if tracks else "another route"
                 words = f"{who} takes {what}{since(at)}: {_instead([e for e, _ in x], [e for e, _ in y])}"
                 # what differs long before is no consequence
                 begins = {c: float(t.tallies[c].figures["first_s"][train]) for c in todo.columns[train]}
@@ -328,7 +328,7 @@ def _exchanged(todo: _Open, kept: Kept, trains: list[int], told: dict[str, Toler
             shared = [(max(time, dict(b)[edge]), edge) for edge, time in a if edge in dict(b)]
             where = f" at {short(min(shared)[1])}" if shared else ""
             names = short(t.trains[one]), short(t.trains[two])
-            words = f"another order{where}: {names[1]} goes as {names[0]} did, and the other way round{since(at)}"
+            words = f"another order{where}{since(at)}: {names[1]} runs as {names[0]} did, and {names[0]} as {names[1]}"
             out.append(todo.close("order", words, [one, two], None, True, from_s=at))
             begins[one] = begins[two] = math.inf
             break
@@ -355,7 +355,7 @@ def _orders(todo: _Open, kept: Kept, trains: list[int], shifts: dict[int, Shift]
             done |= {one, two}
             first, second = (one, two) if switch[2] else (two, one)
             a, b = short(t.trains[first]), short(t.trains[second])
-            words = f"another order at {short(switch[0])}: {b}, {a} instead of {a}, {b}{since(switch[1])}"
+            words = f"another order at {short(switch[0])}{since(switch[1])}: {b}, {a} instead of {a}, {b}"
             if not (one in shifts and two in shifts):
                 words += "; what else differs of these two is counted with it"
             at = min(todo.first_s(one), todo.first_s(two))
