@@ -10,7 +10,10 @@ import pandas as pd
 import pytest
 
 from trainctl.diff.behind import rows_behind
+from trainctl.diff.page import page
+from trainctl.diff.results import github, junit
 from trainctl.diff.runs import diff
+from trainctl.diff.tolerance import parse_tolerances
 from trainctl.errors import InputError
 
 
@@ -88,12 +91,16 @@ def base(tmp_path):
     return tmp_path / "base.xml"
 
 
+IN_TIME = parse_tolerances({"absolute": 0.5, "time_s": 2.0, "ends": "common", "columns": {"x": {"range": 0.01}}})
+
+
 def said(a, b):
-    report = diff(a, b)
-    for line in [*report.lines(), *(f.words for f in report.findings)]:
-        assert line.isprintable() and len(line) < 400, line
-    for f in report.findings:
-        rows_behind(f, report.tables, report.tolerances, 20)
+    for report in (diff(a, b, IN_TIME), diff(a, b)):
+        for line in [*report.lines(), *(f.words for f in report.findings)]:
+            assert line.isprintable() and len(line) < 400, line
+        for f in report.findings:
+            rows_behind(f, report.tables, report.tolerances, 20)
+        page(report), junit(report), github(report)
     return [f.words for f in report.findings]
 
 

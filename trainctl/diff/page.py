@@ -163,7 +163,8 @@ def _of(t: TableDiff, column: str, train: int, report: Report) -> Curves | None:
         return None
     tolerance = report.tolerances.of(t.table, column)
     absolute = tolerance.absolute if tolerance.stated else max(tolerance.absolute, 1.01 * decimal, 1.01 * other)
-    span = float(np.nanmax(a) - np.nanmin(a)) if len(a) else 0.0
+    known = a[np.isfinite(a)]
+    span = float(np.ptp(known)) if len(known) else 0.0
     duration = float(np.ptp(time_a)) if len(time_a) else 0.0
     h = half_widths(absolute, tolerance.relative, tolerance.range, a, span)
     w = half_widths(tolerance.time_s, tolerance.time_relative, tolerance.time_range, time_a, duration)
