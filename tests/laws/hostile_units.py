@@ -19,8 +19,8 @@ WATCHED: tuple[str, ...] = ()
 #: Columns of an estimate, if there is one.
 X, V, W = 0, 1, 2
 
-STYLES = ("full", "bang", "attack", "late", "alternating", "apart", "noise", "huge", "first_brakes", "nan")
-FULL, BANG, ATTACK, LATE, ALTERNATING, APART, NOISE, HUGE, FIRST_BRAKES, NAN = range(10)
+STYLES = ("full", "bang", "attack", "late", "alternating", "apart", "noise", "huge", "first_brakes", "nan", "inching")
+FULL, BANG, ATTACK, LATE, ALTERNATING, APART, NOISE, HUGE, FIRST_BRAKES, NAN, INCHING = range(11)
 
 
 class Params(Table):
@@ -94,6 +94,8 @@ def demand(
             f = 1e300 if chance(c.seed, fast, float(i)) < 0.6 else -1e300
         elif c.style == FIRST_BRAKES:
             f = big if follows else -big
+        elif c.style == INCHING:  # to a stand and on again within each stretch: the ends of steps need not show it
+            f = big if follows and 0.05 < leader[0] % c.every / c.every < 0.25 else -big
         elif c.style == NAN and chance(c.seed, fast, float(i)) < 0.003:
             f = float("nan")
         out[j] = f

@@ -5,15 +5,19 @@ from __future__ import annotations
 import itertools
 import json
 from collections import Counter
+from pathlib import Path
 
+import nets
 import numpy as np
 import pytest
+import tomli_w
 
 import trainctl
 from trainctl.runner import run
 from trainctl.scenario.build import open_scenario
 
 ORDERS = 25
+LAWS = Path(__file__).parents[1] / "laws"
 
 BROKEN_LAW = '''
 """A law that does not care: the first train always brakes, the others always pull."""
@@ -160,3 +164,27 @@ def test_1000_reroute_orders(tmp_path):
         refused, followed = judged(folder, ORDERS)
         total += refused + Counter(followed=followed)
     print(dict(total))
+
+
+@pytest.mark.parametrize("plant", ["coupled_units", "actuated_units"])
+def test_nobody_inches_forward_within_its_steps(tmp_path, plant):
+    """A law that pulls and brakes within a step of 10 s shows no speed at its ends, and must not creep into the train ahead."""
+    line = {"name": "one", "tracks": ["1"], "length_m": 30_000.0, "speed": [[0.0, 30.0]]}
+    (tmp_path / "one.toml").write_text(tomli_w.dumps(line))
+    machine = nets.TYPE | {"units": 2, "unit_length_m": 50.0, "c0_n_per_kg": 0.01}
+    machine |= {"actuator_rate_per_s": 5.0} if plant == "actuated_units" else {}
+    scenario = {
+        "schema_version": 1, "title": "inching", "run": {"duration_s": 1500, "step_s": 10.0, "sub_step_s": 0.05},
+        "network": {"line": "one.toml"}, "plant": {"kind": plant}, "reference": {"speed_mps": 10.0},
+        "controller": {"law": str(LAWS / "hostile_units.py"), "style": "inching", "every_m": 100.0, "big_n": 1e6},
+        "topology": {"spacing_m": 1000.0, "communication_period_s": 10.0},
+        "supervisor": {"mode": "on", "margin_m": 20.0, "emergency_mps2": 0.5, "service_mps2": 0.4},
+        "train_type": {"t": machine},
+        "train": [{"id": str(k), "type": "t", "track": 1, "position_m": x, "speed_mps": 0.0} for k, x in ((1, 2000.0), (2, 1700.0))],
+    }  # fmt: skip
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(scenario))
+    done = run(open_scenario(str(tmp_path / "s.toml")), tmp_path / "out", "numeric")
+    rows = done.trains[done.trains.train == "2"]
+    assert rows.position_m.iloc[-1] > 1750.0  # it does come nearer, and is let do so
+    assert rows.gap_m.min() > 19.9
+    assert rows.position_m.iloc[-1] == pytest.approx(rows.position_m.iloc[-30], abs=1e-6)

@@ -15,7 +15,7 @@ from trainctl.signals import Ints
 #: Rows of one instant, or of a log without times, may not need more than this [bytes].
 INSTANT_BYTES = 1 << 27
 #: Times beyond this [s] are none.
-GREATEST_S = 1e12
+MAXIMUM_S = 1e12
 
 
 class Feed:
@@ -60,9 +60,9 @@ class Feed:
         if self.log.time not in batch.column_names:
             raise InputError(f"{self.log.path}: has rows without {self.log.time}")
         time = floats(batch[self.log.time])
-        if time is None or not np.all(np.abs(time) < GREATEST_S):
+        if time is None or not np.all(np.abs(time) < MAXIMUM_S):
             one_by_one = ((value, floats(pa.chunked_array([[value]]))) for value in batch[self.log.time].to_pylist())
-            wrong = next(value for value, number in one_by_one if number is None or not abs(number[0]) < GREATEST_S)
+            wrong = next(value for value, number in one_by_one if number is None or not abs(number[0]) < MAXIMUM_S)
             raise InputError(
                 f"{self.log.path}: {self.log.time} = {'nothing' if wrong is None else wrong!s:.40}: must be a time in seconds"
             )
