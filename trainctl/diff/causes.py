@@ -151,16 +151,15 @@ def _constant(todo: _Open, name: str, most: bool = True) -> Finding | None:
     if not tally.numbers or not len(trains):
         return None
     f = {key: values[trains] for key, values in tally.figures.items()}
-    enough = f["count"] >= (BELIEVED if len(trains) < BELIEVED else 1)
     low, high = f["shift_low"], f["shift_high"]
-    plus = _agreed(low, high, enough & (low <= high) & (f["count"] == f["rows"]) & (np.sign(low) * np.sign(high) > 0))
+    plus = _agreed(low, high, (low <= high) & (f["count"] == f["rows"]) & (np.sign(low) * np.sign(high) > 0))
     low, high = f["scale_low"], f["scale_high"]
     with np.errstate(invalid="ignore"):
         narrow = np.isfinite(low) & np.isfinite(high) & (high - low < 1e-2 * np.abs(low + high)) & ~((low <= 1.0) & (high >= 1.0))
-        times = _agreed(low, high, enough & (low <= high) & (narrow | ~np.isfinite(low + high)))
+        times = _agreed(low, high, (low <= high) & (narrow | ~np.isfinite(low + high)))
     cause, agreed = ("shift", plus) if plus.sum() >= times.sum() else ("units", times)
     count = int(agreed.sum())
-    if not count or (most and count < len(trains) and (count < 2 or 2 * count <= len(trains))):
+    if f["count"][agreed].sum() < BELIEVED or (most and count < len(trains) and (count < 2 or 2 * count <= len(trains))):
         return None
     own = [int(k) for k in trains[agreed]]
     first = float(f["first_s"][agreed].min()) if t.time is not None else None

@@ -156,10 +156,10 @@ def course(name, edges, speed=20.0, begin=0, n=200, length=1000.0):
     )
 
 
-def found(a, b, **more):
+def found(a, b, sort=("time", "id"), **more):
     from trainctl.diff.causes import causes
 
-    a, b = (pd.concat(parts).sort_values(["time", "id"], kind="stable") for parts in (a, b))
+    a, b = (pd.concat(parts).sort_values(list(sort), kind="stable") for parts in (a, b))
     return causes(compare(log(a, **more), log(b, **more), Tolerances(), {}), Tolerances())
 
 
@@ -195,6 +195,15 @@ def test_a_train_that_is_late_in_two_logs_is_one_finding():
     assert (f.cause, f.trains, f.by, f.tables) == ("late", ["p"], 7.0, ["fcd", "tripinfo"])
     assert f.words == "train p late by 7 s from 61 s on: it stands on b"
     assert f.first.place.time_s == pytest.approx(60.0, abs=1.0)
+
+
+def test_one_value_is_no_shift():
+    how = {"name": "tripinfo", "time": None}
+    a = pd.DataFrame({"id": list("pqrs"), "depart": [0.0, 1.0, 2.0, 3.0], "routeLength": [100.0, 200.0, 300.0, 400.0]})
+    (f,) = found([a], [a.assign(routeLength=[101.0, 203.0, 307.0, 400.0])], sort=["id"], **how)
+    assert (f.cause, f.words) == ("values", "routeLength of trains p, q, r differs by up to 7")
+    (f,) = found([a], [a.assign(routeLength=[101.0, 201.0, 301.0, 400.0])], sort=["id"], **how)
+    assert (f.cause, f.by) == ("shift", 1.0)
 
 
 @pytest.mark.parametrize("others", [[], ["q"], ["q", "r"]])
