@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 from trainctl.diff.columns import floats
 from trainctl.diff.sources import KINDS, sumo_log, sumo_logs_in
 from trainctl.errors import InputError
-from trainctl.record.folder import INFO, free, installed, ours, remove, write_info, write_json
+from trainctl.record.folder import INFO, beside, free, installed, ours, remove, write_info, write_json
 from trainctl.runs.run import Run
 from trainctl.runs.sumo_logs import kind_of
 
@@ -104,8 +104,8 @@ def _of_run(source: Run, place: Path, every_s: float, units_every_s: float) -> N
             _pack(path, place / "sumo" / f"{kind}.xml.gz")
     (place / "events.jsonl").write_bytes((source.folder / "events.jsonl").read_bytes())
     (place / "scenario.toml").write_bytes((source.folder / "scenario.toml").read_bytes())
-    clocks = ("command_line", "wall_time_s")
-    write_info(place, {k: v for k, v in source.info.items() if k not in clocks} | {THINNED: [*steps, "fcd"]})
+    of_the_run = ("command_line", "wall_time_s", "files")
+    write_info(place, {k: v for k, v in source.info.items() if k not in of_the_run} | {THINNED: [*steps, "fcd"]})
 
 
 def _logs(source: Path) -> dict[str, Path]:
@@ -196,12 +196,14 @@ def accept(baseline: Path | str, new: Path | str) -> None:
     Raises
     ------
     InputError
-        They are not of one form: a log in another format, a folder for a file.
+        They are not of one form: a log in another format, a folder for a file; or more than the old run would be lost.
     """
     old, source = Path(baseline), Path(new)
     if golden_of_logs(old) or thinned(old):
         make_golden(source, old, *_steps(old))
     elif ours(old) and ours(source):
+        if others := beside(old):
+            raise InputError(f"{old}: holds {', '.join(others)} beside its run: nothing was accepted")
         _beside(old, lambda fresh: shutil.copytree(source, fresh, dirs_exist_ok=True))
     elif old.is_dir() and source.is_dir():
         there, here = sumo_logs_in(source), sumo_logs_in(old)
