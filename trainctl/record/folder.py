@@ -103,7 +103,7 @@ def held(folder: Path) -> Iterator[None]:
         try:
             fcntl.flock(at, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise InputError(f"{folder}: another process is writing this run") from None
+            raise InputError(f"{folder}: another process is writing there") from None
         yield
     finally:
         os.close(at)
