@@ -73,6 +73,11 @@ class Model:
         return signs.signs(self.roster.signs, self.rails.index)
 
     @property
+    def rerouted(self) -> bool:
+        """Whether trains may be given other routes than they begin with."""
+        return bool(self.scenario.event or self.roster.closings)
+
+    @property
     def placed(self) -> bool:
         """Whether [[train]] tables place the trains: those on one track are a formation with slots. Others come and go."""
         return self.scenario.network.sumocfg is None

@@ -17,6 +17,7 @@ from trainctl.errors import InputError
 from trainctl.scenario.tables import Scenario, TrafficTable, Train, TrainType
 from trainctl.scenario.train_types import fitted, train_type
 from trainctl.signals import Bools, Floats, Ints
+from trainctl.traffic.closings import Closing
 from trainctl.traffic.read import Configuration, Departure, read_traffic
 
 #: Name of the [train_type] of all vTypes without data of their own.
@@ -57,6 +58,7 @@ class Roster(NamedTuple):
     patience: float  # s, who cannot enter for longer does not come; inf: all come
     notes: tuple[str, ...]  # what of the configuration is not followed
     signs: tuple[tuple[float, str, float], ...]  # variable speed signs: from when on [s], edge, limit [m/s]
+    closings: tuple[Closing, ...]  # edges closed for a time, round which trains are led
     source: str  # the SUMO configuration; "" for [[train]] tables
     rails: Rails
     placed: bool  # by [[train]] tables, all there from the start; else they come and go
@@ -71,7 +73,7 @@ def placed(scenario: Scenario, line: Line) -> Roster:
         arrival=np.full(n, np.inf), speed=np.array([t.speed_mps for t in scenario.train], float), like=("",) * n,
         top_speed=np.full(n, np.inf), speed_factor=np.ones(n),
         routes=tuple(line.route(t.track, t.position_m) for t in scenario.train), stops=((),) * n, cooperates=np.ones(n, bool),
-        vclass=("rail",) * n, patience=np.inf, notes=(), signs=(), source="", rails=Rails.of(line), placed=True,
+        vclass=("rail",) * n, patience=np.inf, notes=(), signs=(), closings=(), source="", rails=Rails.of(line), placed=True,
     )  # fmt: skip
 
 
@@ -98,6 +100,10 @@ def from_tables(data: Mapping[str, Any], net: Path) -> Roster:
         patience=float(data["patience"]),
         notes=tuple(data["notes"]),
         signs=tuple((float(t), str(edge), float(v)) for t, edge, v in data["signs"]),
+        closings=tuple(
+            Closing(tuple(at), str(closed), float(begin), float(end), float(share), tuple(types), tuple(classes))
+            for at, closed, begin, end, share, types, classes in data["closings"]
+        ),
         source=str(data["source"]),
         rails=Rails.read(net, {e for route in data["routes"] for e in route}),
         placed=False,
@@ -197,6 +203,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
             *fitted(kind for name, kind in traffic.kinds.items() if name not in scenario.train_type),
             *_slower(scenario, traffic, rails, routes),
         ),
+        closings=tuple(c._replace(begin=c.begin - traffic.begin_s, end=c.end - traffic.begin_s) for c in traffic.closings),
         source=str((folder / str(scenario.network.sumocfg)).resolve()),
         signs=tuple((t - traffic.begin_s, edge, v) for t, edge, v in traffic.signs),
         rails=rails,

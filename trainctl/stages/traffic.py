@@ -11,7 +11,8 @@ from trainctl.monitors import waiting
 from trainctl.railway import along, authority, interlocking, signs, supervisor
 from trainctl.railway.authority import DRIVER_MARGIN_M, View
 from trainctl.railway.interlocking import Held
-from trainctl.railway.ways import Ways
+from trainctl.railway.ways import Ways, moved
+from trainctl.railway.ways import ways as laid
 from trainctl.scenario.model import Model
 from trainctl.scenario.roster import Stop
 from trainctl.signals import Bools, Floats, Ints, Seen
@@ -82,6 +83,8 @@ class Traffic:
         self.requesting = np.minimum(p.assumed.braking, planned)  # what is requested for, and braked with at least
         self.ways: Ways | None = None
         self._limits(0.0)
+        routes = [[p.line.index[e] for e in route] for route in p.roster.routes]
+        self.first_ways, self.stops = laid(routes, p.line.start_m, p.line.length_m), list(p.roster.stops)
 
     def initial(self) -> State:
         """Before the run: trains that are placed have come."""
@@ -103,6 +106,11 @@ class Traffic:
         if not self.looks:
             return s, nothing(len(speed))
         self._limits(t)
+        if self.ways is not ways and self.stops_of.any():  # they changed: the places of stops count along them
+            self.stops = [
+                tuple(stop._replace(place=moved(self.first_ways, ways, i, stop.place)) for stop in stops)
+                for i, stops in enumerate(self.roster.stops)
+            ]
         for i in [] if s.came.all() else np.flatnonzero(~s.came & self._given_up(t) & ~self._given_up(t - self.step_s)).tolist():
             self.journal.event(t, "given_up", train=self.p.scenario.ids[i], planned_s=float(self.roster.depart[i]))
         s, stops, soon = self._stops(t, seen, speed, overrun, s)
@@ -230,7 +238,7 @@ class Traffic:
 
     def stop_of(self, i: int, s: State) -> Stop | None:
         """The next stop of a train."""
-        stops, k = self.roster.stops[i], int(s.next_stop[i])
+        stops, k = self.stops[i], int(s.next_stop[i])
         return stops[k] if k < len(stops) else None
 
     def _full(self, stop: Stop, s: State) -> bool:
@@ -260,7 +268,13 @@ class Traffic:
         )  # fmt: skip
         for i in np.flatnonzero(seen.present & (s.next_stop < self.stops_of)).tolist():
             stop = self.stop_of(i, s)
-            assert stop is not None
+            while stop is not None and np.isnan(stop.place):
+                self.journal.event(t, "stop_dropped", train=self.p.scenario.ids[i], stop=stop.name)
+                s.next_stop[i] += 1
+                stop = self.stop_of(i, s)
+            if stop is None:
+                s.stopping[i] = False
+                continue
             room = self._place(stop, s) - float(seen.position[i])
             if standing[i]:
                 if t < s.stands_until[i] - 1e-9 or s.parked[i]:

@@ -83,7 +83,7 @@ def read_demand(additional: list[Path], routes: list[Path]) -> Elements:
             tag = element.tag
             if tag in _TRAINS:
                 depart = element.get("begin" if tag == "flow" else "depart", "0")
-                begins = seconds(depart) if is_time(depart) else -math.inf
+                begins = seconds(depart) if is_time(depart) else last  # what is no time is told later
                 (d.late if begins < last and path not in additional else d.trains).append(element)
                 last = max(last, begins)
             elif tag in named or tag in PLACES:
@@ -110,7 +110,7 @@ def _elements(path: Path, within: tuple[Path, ...] = ()) -> Iterator[Element]:
     if path.resolve() in within:
         raise InputError(f"{path}: includes itself")
     for element in parse(path):
-        if element.tag == "variableSpeedSign" and element.get("file"):
+        if element.tag in ("variableSpeedSign", "rerouter") and element.get("file"):
             element.set("file", str(path.parent / element.get("file", "")))
         if element.tag == "include":
             yield from _elements(path.parent / element.get("href", ""), (*within, path.resolve()))

@@ -168,7 +168,6 @@ NAMED: Mapping[tuple[str, str], tuple[str, frozenset[str]] | Refused] = {
 
 #: Whole elements of route and additional files that are not followed, in which words.
 ELEMENTS_NAMED: Mapping[str, str | Refused] = {
-    "rerouter": "trains keep their routes",
     "calibrator": "no train is let in or taken out by it",
     "railSignalConstraints": "trains go first come, first served",
     "tlLogic": "signals are not obeyed; our own interlocking keeps trains apart",
@@ -182,11 +181,10 @@ ELEMENTS_NAMED: Mapping[str, str | Refused] = {
     "interval": "flows between edges or zones have no route here",
     "relation": "they say nothing of a train here",
     "deadlock": "our own interlocking keeps trains apart",
-    "closeLane": "no lane is closed", "closingReroute": "no edge is closed", "closingLaneReroute": "no lane is closed",
 }  # fmt: skip
 
 #: Whole elements of additional files that are followed.
-ELEMENTS_FOLLOWED = _words("variableSpeedSign")
+ELEMENTS_FOLLOWED = _words("variableSpeedSign rerouter")
 
 #: Elements that cannot change the run of a train: outputs, drawings, and what belongs to roads.
 ELEMENTS_OF_NO_EFFECT = _words(

@@ -18,6 +18,7 @@ from trainctl import draws
 from trainctl.errors import InputError
 from trainctl.traffic import crossings
 from trainctl.traffic.checks import not_followed, rail_trains, refuse
+from trainctl.traffic.closings import Closing, closings
 from trainctl.traffic.duarouter import expand
 from trainctl.traffic.files import (
     PLACES,
@@ -92,6 +93,7 @@ class Configuration(NamedTuple):
     patience_s: float  # after this time trains that could not enter do not come any more; inf: they always do
     notes: tuple[str, ...]  # what is not followed
     signs: tuple[Change, ...]  # variable speed signs
+    closings: tuple[Closing, ...]
 
 
 def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, seed: int = 42) -> Configuration:
@@ -154,6 +156,9 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
     if refused:
         raise InputError([f"{sumocfg}: {line}" for line in refused])
     signs, wrong = speed_signs(elements.others, tracks)
+    closed, rerouter_notes, mistakes = closings(elements.others, tracks, {k.vclass for k in kinds.values()})
+    more_notes += rerouter_notes
+    wrong += mistakes
     if wrong:
         raise InputError([f"{sumocfg}: {line}" for line in wrong])
     refuse(sumocfg, net[0], trains, elements, kinds, tracks)
@@ -203,6 +208,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         patience_s=seconds(patience) if seconds(patience) >= 0 else math.inf,
         notes=(*notes, *more_notes),
         signs=tuple(signs),
+        closings=tuple(closed),
     )
 
 

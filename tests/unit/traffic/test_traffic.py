@@ -87,10 +87,10 @@ def in_sumo(folder: Path, script: str) -> Any:
 
 def test_flows_become_trains(files: Files) -> None:
     traffic = files.read(
-        '<flow id="n" type="t" begin="20" number="3" end="50" route="main"/>'
         '<flow id="p" type="t" begin="0" period="30" end="100" route="main"/>'
-        '<flow id="h" type="t" begin="5" vehsPerHour="120" end="100" from="ab" to="cd"/>'
         '<flow id="q" type="t" begin="0" number="2" period="7.25" route="main"/>'
+        '<flow id="h" type="t" begin="5" vehsPerHour="120" end="100" from="ab" to="cd"/>'
+        '<flow id="n" type="t" begin="20" number="3" end="50" route="main"/>'
     )
     times = {name: [d.depart_s for d in traffic.departures if d.id.startswith(f"{name}.")] for name in "nphq"}
     assert times == {"n": [20, 30, 40], "p": [0, 30, 60, 90], "h": [5, 35, 65, 95], "q": [0, 7.25]}
@@ -143,12 +143,13 @@ def test_a_fraction_of_the_trains_comes_that_comes_in_sumo(files: Files, scale: 
 
 
 def test_trains_out_of_order_in_a_route_file_do_not_come_as_in_sumo(files: Files) -> None:
-    def v(name: str, depart: float) -> str:
-        return f'<vehicle id="{name}" type="t" depart="{depart}" route="main"/>'
+    def v(name: str, depart: float, kind: str = 'type="t"') -> str:
+        return f'<vehicle id="{name}" {kind} depart="{depart}"><route edges="ab bc cd"/></vehicle>'
 
     flow = '<flow id="f" type="t" begin="90" period="60" number="2" route="main"/>'
     body = v("a", 40) + v("b", 0) + v("c", 60) + f'<trip id="d" type="t" depart="50" from="ab" to="cd"/>{v("e", 100)}{flow}'
-    traffic = files.read(body, stops=STOPS.replace("</additional>", f"{v('g', 30)}{v('h', 20)}</additional>"))
+    own, of = '<vType id="o" vClass="rail"/>', 'type="o"'
+    traffic = files.read(body, stops=STOPS.replace("</additional>", f"{own}{v('g', 30, of)}{v('h', 20, of)}</additional>"))
     sumo, environment = program("sumo")
     options = ["--no-step-log", "--insertion-checks", "none", "--tripinfo-output", "t.xml"]
     subprocess.run([sumo, "-c", "run.sumocfg", *options], cwd=files.folder, env=environment, check=True, capture_output=True)
@@ -156,6 +157,20 @@ def test_trains_out_of_order_in_a_route_file_do_not_come_as_in_sumo(files: Files
     assert {d.id for d in traffic.departures} == theirs == set("aceg") | {"h"}
     told = "3 vehicles, trips and flows left out, as in SUMO: a route file goes by departure times: b, d, f"
     assert told in traffic.notes
+
+
+def test_mistakes_in_signs_and_rerouters_are_told(files: Files) -> None:
+    wrong = (
+        '<variableSpeedSign id="s" lanes="nope_0"><step time="x" speed="y"/></variableSpeedSign><variableSpeedSign id="u"/>'
+        '<rerouter id="r" edges="ab nope" probability="p"><interval begin="z"><closingReroute id="gone"/></interval></rerouter>'
+    )
+    told = files.mistakes(f'{V} route="main"/>', stops=STOPS.replace("</additional>", f"{wrong}</additional>"))
+    assert told == [f"{files.sumocfg}: {line}" for line in (
+        "variableSpeedSign s: lane nope_0: not in the net", "variableSpeedSign s: step time = x: must be a time",
+        "variableSpeedSign s: step speed = y: must be a number", "variableSpeedSign u: no lanes",
+        "rerouter r: edge nope: not in the net", "rerouter r: probability = p: must be a number, not negative",
+        "rerouter r: interval z: must be a time", "rerouter r: closingReroute gone: not in the net",
+    )]  # fmt: skip
 
 
 def test_trips_become_the_routes_of_sumo(files: Files) -> None:
@@ -274,7 +289,7 @@ def test_what_is_not_followed_is_told(files: Files) -> None:
         '<vehicle id="v" type="loose" depart="0" departPos="random" departSpeed="avg" arrivalSpeed="0" speedFactor="0.7"><route '
         'edges="ab bc"/><stop lane="bc_0" endPos="20" duration="3" triggered="true"/></vehicle>'
         '<person id="p" depart="0"><walk edges="zx"/></person><containerFlow id="k" begin="0" number="1" end="5"/>',
-        stops=STOPS.replace("</additional>", '<rerouter id="r" edges="ab"/></additional>'),
+        stops=STOPS.replace("</additional>", '<calibrator id="r" edge="ab"/></additional>'),
     )
     assert [d.id for d in traffic.departures] == ["v"]
     assert set(traffic.kinds) == {"loose"} and traffic.kinds["loose"].speed_factor == 0.8
@@ -288,7 +303,7 @@ def test_what_is_not_followed_is_told(files: Files) -> None:
         "1 x <vehicle arrivalSpeed>: not followed: trains leave as fast as they come",
         "1 x <vehicle speedFactor>: not followed: that of the vType holds",
         "1 x <stop triggered>: not followed: nobody boards; a train stands as long as duration and until say",
-        "1 x <rerouter>: not followed: trains keep their routes",
+        "1 x <calibrator>: not followed: no train is let in or taken out by it",
     )
 
 
