@@ -112,19 +112,38 @@ def shown():
     return {paper: rows_of(text) for paper, text in zip(parts[::2], parts[1::2], strict=True)}
 
 
+def check_page(claims):
+    """Rows of the page are these claims; numbers agree to 1 %, but for rounding residues, which differ between machines."""
+    pages = shown()
+    for paper in {c.paper for c in claims}:
+        measured = rows_of(as_markdown([c for c in claims if c.paper == paper]))
+        hint = "out of date: trainctl claims --json > claims.json; python tools/claims_page.py claims.json"
+        assert [row[:2] + row[3:5] for row in pages[paper]] == [row[:2] + row[3:5] for row in measured], hint
+        for old, new in zip(pages[paper], measured, strict=True):
+            known, found = (np.array(re.findall(r"-?\d+(?:\.\d+)?(?:e[+-]\d+)?", row[2]), float) for row in (old, new))
+            assert len(known) == len(found), hint
+            kept = (np.abs(found) > 1e-4) & (np.abs(found) < 1e8)
+            np.testing.assert_allclose(known[kept], found[kept], rtol=0.01, err_msg=f"{new[0]}: {hint}")
+
+
 def test_the_page_shows_all_papers_and_what_is_measured(quick):
     assert list(shown()) == list(PAPERS)
     for work in PAPERS.values():
         assert work.text() in PAGE.read_text(encoding="utf-8")
+    check_page(quick)
 
-    def words(cells):  # rounding residues differ between machines
-        return cells[:2] + cells[3:5]
 
-    for paper in ("fully_distributed", "robust_constrained"):
-        measured = [words(row) for row in rows_of(as_markdown([c for c in quick if c.paper == paper]))]
-        assert [words(row) for row in shown()[paper]] == measured, (
-            "out of date: trainctl claims --json > claims.json; python tools/claims_page.py claims.json"
-        )
+def test_the_page_shows_what_the_continuous_laws_do():
+    """The slower half, ten seconds on both processors."""
+    found = measure(["emu_finite_time", "fault_tolerant"], workers=2)
+    assert len(found) > 40
+    check_page(found)
+
+
+def test_a_page_that_is_out_of_date_is_found(quick):
+    wrong = [c._replace(measured=1.02 * c.measured) if c.claim.startswith("Assumption 1") else c for c in quick]
+    with pytest.raises(AssertionError, match="Assumption 1: kappa > 10: out of date"):
+        check_page(wrong)
 
 
 def test_every_claim_that_is_not_reproducible_names_what_was_tried():
@@ -182,13 +201,15 @@ def test_errors_of_the_observer_are_the_same_under_another_input():
     assert np.abs(printed.fault_error - one.fault_error).max() > 1e-2
 
 
-@pytest.mark.campaign
-def test_all_claims_take_less_than_a_minute():
-    import time
-
-    began = time.perf_counter()
-    found = measure(workers=2)
-    assert time.perf_counter() - began < 60.0
-    for paper in PAPERS:
-        verdicts = [(c.claim, c.verdict) for c in found if c.paper == paper]
-        assert verdicts == [(row[0].replace("\\|", "|"), row[4]) for row in shown()[paper]]
+def test_forces_that_do_not_move_at_the_edges_of_faults_are_told():
+    """Fig. 8: beyond what the profile needs there are 68 kN at an edge, 0.1 kN elsewhere; without faults the edges are nothing."""
+    module = import_module("trainctl.claims.fault_tolerant")
+    with_faults, without = (
+        module.Example(module.paper_scene(module.COARSE), faults=f).run(560.0) for f in (module.paper_faults(), [])
+    )
+    first, edges, elsewhere = with_faults.deviations()
+    assert first > edges > 50.0 * elsewhere > 0.0
+    assert without.deviations()[1] < 0.5
+    runs = module.Runs()
+    runs.__dict__["clean"] = without
+    assert by_text(module.convergence(runs), "Fig. 8").verdict == NOT
