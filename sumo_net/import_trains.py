@@ -2,7 +2,7 @@
 
 Symbols
 -------
-F, P         greatest tractive effort [N] and power [W] of our trains: effort min(F, P / v)
+F, P         maximum tractive effort [N] and power [W] of our trains: effort min(F, P / v)
 c0, c1, c2   Davis coefficients per mass [N/kg], [N s/(m kg)], [N s2/(m2 kg)]
 v00, dv      100 km/h and the 15 km/h of head wind of railtoolkit's resistance formula [m/s]
 """
@@ -54,9 +54,9 @@ def ttobench(data: Place, options: Options) -> Imported:
     assert length is not None
     mass = data["mass"].quantity("mass", above=0.0)
     rotating = _rotating(data["rho"]) if data.has("rho") else 1.0
-    r0 = data["rolling resistance r0"].quantity("force", least=0.0)
-    r1 = data["rolling resistance r1"].quantity("force per speed", least=0.0)
-    r2 = data["rolling resistance r2"].quantity("force per speed squared", least=0.0)
+    r0 = data["rolling resistance r0"].quantity("force", minimum=0.0)
+    r1 = data["rolling resistance r1"].quantity("force per speed", minimum=0.0)
+    r2 = data["rolling resistance r2"].quantity("force per speed squared", minimum=0.0)
     brake, brake_power, said = _ttobench_brakes(data, mass * rotating)
     notes = [said, "the comfort limit of acceleration is left out: keep it with the reference" * data.has("max acceleration")]
     values = {
@@ -88,17 +88,17 @@ def _top_speed(kmh: float) -> str:
 
 def _rotating(rho: Place) -> float:
     """Inertia over mass: per cent to be added, or the factor itself."""
-    value = rho["value"].number(least=0.0)
+    value = rho["value"].number(minimum=0.0)
     return 1.0 + value * rho["unit"].factor("share") if rho["unit"].value == "%" else max(1.0, value * rho["unit"].factor("share"))
 
 
 def _ttobench_brakes(data: Place, inertia: float) -> tuple[float, float | None, str]:
     """Braking effort [N], braking power [W] or None, and how they came about."""
-    force = data["max reg braking force"].quantity("force", least=0.0)
-    power: float | None = data["max reg braking power"].quantity("power", least=0.0)
+    force = data["max reg braking force"].quantity("force", minimum=0.0)
+    power: float | None = data["max reg braking power"].quantity("power", minimum=0.0)
     said = "braking: electric brakes alone"
     if data.has("max pn braking force"):
-        force, power = force + data["max pn braking force"].quantity("force", least=0.0), None
+        force, power = force + data["max pn braking force"].quantity("force", minimum=0.0), None
         said = "braking: electric and pneumatic brakes together, hence without a power limit"
     if data.has("max deceleration"):
         most = data["max deceleration"].quantity("acceleration", above=0.0) * inertia
@@ -175,9 +175,9 @@ class Vehicle(NamedTuple):
 
 def _vehicle(v: Place, load_share: float) -> Vehicle:
     empty = 1e3 * v["mass"].number(above=0.0)
-    loaded = empty + 1e3 * load_share * (v["load_limit"].number(least=0.0) if v.has("load_limit") else 0.0)
+    loaded = empty + 1e3 * load_share * (v["load_limit"].number(minimum=0.0) if v.has("load_limit") else 0.0)
     base, rolling, air = (
-        v[key].number(least=0.0) * 1e-3 * GRAVITY if v.has(key) else 0.0
+        v[key].number(minimum=0.0) * 1e-3 * GRAVITY if v.has(key) else 0.0
         for key in ("base_resistance", "rolling_resistance", "air_resistance")
     )
     kind = v["vehicle_type"].text()
@@ -190,7 +190,7 @@ def _vehicle(v: Place, load_share: float) -> Vehicle:
         resistance = np.array([base * driving + rolling * (empty - driving), 0.0, 0.0]) + empty * square
     else:
         resistance = loaded * (np.array([base, rolling / V00, 0.0]) + square)
-    factor = v["rotation_mass"].number(least=1.0) if v.has("rotation_mass") else 1.0
+    factor = v["rotation_mass"].number(minimum=1.0) if v.has("rotation_mass") else 1.0
     return Vehicle(v["length"].number(above=0.0), loaded, factor * empty + loaded - empty, resistance)
 
 
@@ -208,14 +208,14 @@ def _unit(part: Sequence[Vehicle], motors: Sequence[Fit], deceleration: float) -
 
 def _effort(v: Place) -> Floats:
     rows = [row.row(2) for row in v["tractive_effort"].items()]
-    curve = np.array(sorted((a.number(least=0.0) / 3.6, b.number(least=0.0)) for a, b, *_ in rows))
+    curve = np.array(sorted((a.number(minimum=0.0) / 3.6, b.number(minimum=0.0)) for a, b, *_ in rows))
     if len(curve) < 3 or curve[-1, 0] <= 0.0 or curve[:, 1].max() <= 0.0:
         raise v["tractive_effort"].wrong("must have at least three pairs [speed in km/h, force in N], with forces above 0")
     return curve
 
 
 def fitted(curve: Floats) -> Fit:
-    """Least squares of min(F, P / v) to an effort curve, evenly over its range of speed.
+    """Minimum squares of min(F, P / v) to an effort curve, evenly over its range of speed.
 
     Parameters
     ----------

@@ -99,19 +99,19 @@ class Place:
             raise self.wrong("must be a list with at least one item")
         return [Place(v, self.file, f"{self.key}[{k}]") for k, v in enumerate(self.value, 1)]
 
-    def row(self, least: int) -> list[Place]:
+    def row(self, minimum: int) -> list[Place]:
         """The items of a list of at least this many."""
         found = self.items()
-        if len(found) < least:
-            raise self.wrong(f"must have {least} items, has {len(found)}")
+        if len(found) < minimum:
+            raise self.wrong(f"must have {minimum} items, has {len(found)}")
         return found
 
-    def number(self, above: float = -math.inf, least: float = -math.inf) -> float:
+    def number(self, above: float = -math.inf, minimum: float = -math.inf) -> float:
         """A finite number, above the one bound and not below the other."""
         if isinstance(self.value, bool) or not isinstance(self.value, int | float) or not math.isfinite(self.value):
             raise self.wrong(f"must be a number, is {str(self.value)[:40]}")
-        if self.value <= above or self.value < least:
-            rule = f"above {above:g}" if self.value <= above else f"at least {least:g}"
+        if self.value <= above or self.value < minimum:
+            rule = f"above {above:g}" if self.value <= above else f"at least {minimum:g}"
             raise self.wrong(f"must be {rule}, is {self.value:g}")
         return float(self.value)
 
@@ -128,9 +128,9 @@ class Place:
             raise self.wrong(f"unit {self.text()}: must be one of {', '.join(known)}")
         return known[self.text()]
 
-    def quantity(self, kind: str, above: float = -math.inf, least: float = -math.inf) -> float:
+    def quantity(self, kind: str, above: float = -math.inf, minimum: float = -math.inf) -> float:
         """``{"unit": ..., "value": ...}`` in SI."""
-        return self["value"].number(above, least) * self["unit"].factor(kind)
+        return self["value"].number(above, minimum) * self["unit"].factor(kind)
 
 
 def convert(path: str | Path, options: Options) -> Imported:
@@ -230,7 +230,7 @@ def _ttobench_track(data: Place, options: Options) -> Imported:
     stops: list[tuple[float, str]] = []
     if data.has("stops"):
         factor = data["stops"]["unit"].factor("length")
-        stops = [(s.number(least=0.0) * factor, f"stop {k}") for k, s in enumerate(data["stops"]["values"].items(), 1)]
+        stops = [(s.number(minimum=0.0) * factor, f"stop {k}") for k, s in enumerate(data["stops"]["values"].items(), 1)]
     length = options.length_m if options.length_m is not None else stops[-1][0] if stops else None
     if length is None:
         raise data.wrong("missing, and it would tell the length of the line: give --length-m", "stops")
@@ -246,7 +246,7 @@ def _steps(table: Place, key: str, kind: str) -> Steps:
     units = table["units"]
     along, factor = units["position"].factor("length"), units[key].factor(kind)
     rows = [row.row(2) for row in table["values"].items()]
-    return [(a.number(least=0.0) * along, b.number() * factor) for a, b, *_ in rows]
+    return [(a.number(minimum=0.0) * along, b.number() * factor) for a, b, *_ in rows]
 
 
 def _railtoolkit_path(data: Place, options: Options) -> Imported:

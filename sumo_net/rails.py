@@ -398,7 +398,7 @@ def _crossing(
 
 
 def _apart(one: Floats, other: Floats) -> float:
-    """The least distance of two polylines (P, 3) and (Q, 3) seen from above [m]; 0 where they cross."""
+    """The minimum distance of two polylines (P, 3) and (Q, 3) seen from above [m]; 0 where they cross."""
     a, b, c, d = one[:-1, None, :2], one[1:, None, :2], other[None, :-1, :2], other[None, 1:, :2]
 
     def side(begin: Floats, end: Floats, point: Floats) -> Floats:

@@ -25,8 +25,8 @@ from trainctl import runner
 from trainctl.errors import InputError, TrainctlError
 from trainctl.loop import Loop
 from trainctl.numeric import Numeric
-from trainctl.scenario.build import prepare
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.build import model_of
+from trainctl.scenario.model import Model
 from trainctl.scenario.reading import examine
 
 LAWS = Path(__file__).parent / "laws"
@@ -160,7 +160,7 @@ def machine(draw: random.Random, kind: str, units: bool, length: float) -> Train
     return Train({"kind": kind}, type_, length, brakes / type_["rotating_mass_factor"], rate, number * mass)
 
 
-AMPLITUDES = {  # channel: key, unit, greatest
+AMPLITUDES = {  # channel: key, unit, maximum
     "position": ("m", 0.05), "speed": ("mps", 0.02), "input": ("mps2", 0.12), "resistance": ("percent", 40.0), "measurement": ("m", 15.0)
 }  # fmt: skip
 
@@ -168,8 +168,8 @@ AMPLITUDES = {  # channel: key, unit, greatest
 def disturbance(draw: random.Random, step: float, sampled: bool, ids: list[str], far: float) -> dict[str, Any]:
     """One entry of [[disturbance]]; those of position and speed, which are per step, grow with the step."""
     on = draw.choice([c for c in AMPLITUDES if sampled or c != "measurement"])
-    unit, greatest = AMPLITUDES[on]
-    value = round(draw.choice([-1, 1]) * draw.uniform(0.2, 1.0) * greatest * (step if on in ("position", "speed") else 1.0), 6)
+    unit, maximum = AMPLITUDES[on]
+    value = round(draw.choice([-1, 1]) * draw.uniform(0.2, 1.0) * maximum * (step if on in ("position", "speed") else 1.0), 6)
     key = "error_percent" if on == "resistance" else f"amplitude_{unit}"
     shape = draw.choice(["constant", "alternating", "sine", "square", "uniform", "gaussian", "step", "gust", "table"])
     entry: dict[str, Any] = {"on": on, "shape": shape, key: value}
@@ -432,13 +432,13 @@ class Deaf:
         """One instant."""
 
 
-def opened(case: Case, mode: str) -> Prepared:
+def opened(case: Case, mode: str) -> Model:
     """The scenario, checked."""
     tables = case.tables | {"supervisor": case.tables["supervisor"] | {"mode": mode}}
     scenario, found = examine(tables)
     if scenario is None:
         raise InputError(found)
-    return prepare(scenario, "s.toml", case.folder, found)
+    return model_of(scenario, "s.toml", case.folder, found)
 
 
 def driven(case: Case, mode: str = "on", backend: str = "numeric") -> Outcome:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 
 #: Trains that touch do not overlap; rounding of positions that add up over a run [m].
 TOUCH_M = 1e-3
@@ -32,7 +32,7 @@ class Tracks(NamedTuple):
     time: np.ndarray  # (K,) s
     along: np.ndarray  # (K, n) m, front, from the beginning of the train's way
     speed: np.ndarray  # (K, n) m/s, of the front
-    least: np.ndarray  # (K, n) m/s, of the slowest unit
+    minimum: np.ndarray  # (K, n) m/s, of the slowest unit
     present: np.ndarray  # (K, n)
     ways: list[np.ndarray]  # edges of every train's way
 
@@ -48,17 +48,17 @@ class Findings(NamedTuple):
 class Recording:
     """Gathers ``Tracks`` from a simulation: ``look`` before the first step and after every one."""
 
-    def __init__(self, p: Prepared) -> None:
+    def __init__(self, p: Model) -> None:
         self.p = p
         self.rows: list[tuple[Any, ...]] = []
 
     def look(self, sim: Any) -> None:
         """Write down where the fronts are, as the world measures it."""
         seen, ways = sim.world.measure(), sim.world.ways
-        own, heads = sim.state.own, self.p.heads
+        own, leading = sim.state.own, self.p.leading
         along = seen.position - ways.begin[ways.first[:-1]]
-        least = np.minimum.reduceat(own[:, 1], heads)
-        self.rows.append((sim.time, along, own[heads, 1].copy(), least, seen.present.copy()))
+        minimum = np.minimum.reduceat(own[:, 1], leading)
+        self.rows.append((sim.time, along, own[leading, 1].copy(), minimum, seen.present.copy()))
         self.ways = [ways.edge[a:b].copy() for a, b in zip(ways.first[:-1], ways.first[1:], strict=True)]
 
     def tracks(self) -> Tracks:
@@ -66,12 +66,12 @@ class Recording:
         return Tracks(*(np.array(column) for column in zip(*self.rows, strict=True)), self.ways)
 
 
-def judge(p: Prepared, tracks: Tracks) -> Findings:
+def judge(p: Model, tracks: Tracks) -> Findings:
     """Overlaps, overspeeds and backward motion in a run."""
     return Findings(overlap(p, tracks), overspeed(p, tracks), backwards(p, tracks))
 
 
-def behind(p: Prepared, edge: int) -> int:
+def behind(p: Model, edge: int) -> int:
     """The edge before another one, if that is certain; -1: there is none, or several."""
     rails = p.rails
     found = [e for e in rails.before[edge] if (e, edge) not in rails.reversal]
@@ -81,7 +81,7 @@ def behind(p: Prepared, edge: int) -> int:
     return found[0] if len(found) == 1 else -1
 
 
-def laid(p: Prepared, way: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
+def laid(p: Model, way: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
     """A way with what lies before it, as far as a train of this length hangs out, and where each of its edges begins [m]."""
     edges, hangs = way.tolist(), 0.0
     while hangs < length and (before := behind(p, edges[0])) >= 0 and len(edges) < 10_000:
@@ -91,7 +91,7 @@ def laid(p: Prepared, way: np.ndarray, length: float) -> tuple[np.ndarray, np.nd
     return np.array(edges), begins
 
 
-def bodies(p: Prepared, tracks: Tracks, frames: np.ndarray, present: np.ndarray) -> tuple[np.ndarray, ...]:
+def bodies(p: Model, tracks: Tracks, frames: np.ndarray, present: np.ndarray) -> tuple[np.ndarray, ...]:
     """Frame, train, edge, from and to [m] of every piece of track under a train; of an edge and its twin the first stands for both.
 
     ``frames`` (F, n) are places of the fronts along the ways.
@@ -111,7 +111,7 @@ def bodies(p: Prepared, tracks: Tracks, frames: np.ndarray, present: np.ndarray)
     return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
 
-def overlap(p: Prepared, tracks: Tracks) -> str | None:
+def overlap(p: Model, tracks: Tracks) -> str | None:
     """The deepest overlap of two bodies, or of two on tracks that cross, with its first instant."""
     n, lengths = len(tracks.ways), p.consists.train_length()
     if n < 2 or len(tracks.time) < 2:
@@ -163,8 +163,8 @@ def crossed(
     return found
 
 
-def overspeed(p: Prepared, tracks: Tracks) -> str | None:
-    """The greatest excess over the limit of any edge under a train."""
+def overspeed(p: Model, tracks: Tracks) -> str | None:
+    """The maximum excess over the limit of any edge under a train."""
     worst = (OVERSPEED_MPS, "")
     for i, way in enumerate(tracks.ways):
         begins = np.concatenate([[0.0], np.cumsum(p.rails.length_m[way])])
@@ -179,13 +179,13 @@ def overspeed(p: Prepared, tracks: Tracks) -> str | None:
     return worst[1] or None
 
 
-def backwards(p: Prepared, tracks: Tracks) -> str | None:
+def backwards(p: Model, tracks: Tracks) -> str | None:
     """The first time that a train, or one of its units, moves backwards."""
     ids, there = p.scenario.ids, tracks.present[1:] & tracks.present[:-1]
     for what, broken, value in (
         ("place", (np.diff(tracks.along, axis=0) < -BACKWARDS) & there, np.diff(tracks.along, axis=0)),
         ("speed", (tracks.speed < -BACKWARDS) & tracks.present, tracks.speed),
-        ("unit", (tracks.least < -1e-3) & tracks.present, tracks.least),
+        ("unit", (tracks.minimum < -1e-3) & tracks.present, tracks.minimum),
     ):
         if broken.any():
             k, i = (int(x) for x in np.argwhere(broken)[0])

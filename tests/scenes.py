@@ -10,7 +10,7 @@ from trainctl.signals import Bounds, Consists, Links, Reference, Scene
 
 
 def coupled_trains(positions: tuple[float, ...], units: int, reference: Reference, **consist: Any) -> Scene:
-    """Trains of light couplers and no limits at 80 m/s, with heads at ``positions``.
+    """Trains of light couplers and no limits at 80 m/s, with leading units at ``positions``.
 
     Neighbours hear each other and want 3000 m from rear to front, the first wants to be at the reference. ``consist`` replaces
     fields of ``Consists``.

@@ -16,7 +16,7 @@ from trainctl.railway.along import Ahead
 from trainctl.railway.authority import View
 from trainctl.railway.supervisor import Limits, Targets
 from trainctl.scenario.build import open_scenario
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import POSITION, SPEED, Bools, Floats, Formed, Seen
 from trainctl.stages.traffic import Around
 
@@ -37,13 +37,13 @@ class Told(list[tuple[str, dict[str, Any]]]):
         return [(kind, fields.get("train", "")) for kind, fields in self]
 
 
-def prepared(folder: Path, law: str, **changes: Any) -> Prepared:
+def prepared(folder: Path, law: str, **changes: Any) -> Model:
     """The scenario of ``a.sumocfg`` in ``folder`` under a law."""
     (folder / "s.toml").write_text(tomli_w.dumps(nets.scenario(law, 100, **changes)))
     return open_scenario(str(folder / "s.toml"))
 
 
-def started(p: Prepared) -> tuple[Loop, Told]:
+def started(p: Model) -> tuple[Loop, Told]:
     """A loop whose trains have been put on the railway, and what it told."""
     told = Told()
     return Loop(p, Numeric(p.line), told), told  # type: ignore[arg-type]
@@ -76,12 +76,12 @@ def around(view: View, stops: tuple[list[int], list[float]] = ([], []), soon: Bo
     return Around((), where, np.zeros(n, bool) if soon is None else soon, None, {}, view)
 
 
-def side_by_side(p: Prepared, spacings: list[float], speed: float) -> tuple[Seen, Floats]:
+def side_by_side(p: Model, spacings: list[float], speed: float) -> tuple[Seen, Floats]:
     """Every train on the net, each so far behind the one before."""
     own, n = p.own.copy(), len(p.scenario.ids)
-    own[p.heads, POSITION], own[:, SPEED] = -np.cumsum([0.0, *spacings]), speed
+    own[p.leading, POSITION], own[:, SPEED] = -np.cumsum([0.0, *spacings]), speed
     nowhere = np.zeros(n, np.int64)
-    return Seen(own[p.heads, POSITION].copy(), nowhere, nowhere, np.ones(n, bool)), own
+    return Seen(own[p.leading, POSITION].copy(), nowhere, nowhere, np.ones(n, bool)), own
 
 
 def chained(formed: Formed, ahead: list[int]) -> Formed:

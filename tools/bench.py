@@ -29,7 +29,7 @@ processor is told too (``cpu_``, all threads): where others use the machine it i
 
 ``--against CHECKOUT`` compares this checkout with another one: the same cases, those with our loop, driven through
 ``trainctl.Simulation`` from either. Both take turns every few steps as the cases do; told are medians of the ratios within a pair,
-this checkout over the other, with the least and the greatest. Closing the logs is left out.
+this checkout over the other, with the minimum and the maximum. Closing the logs is left out.
 
 ``--instructions`` counts instead of measuring: instructions per train and step, by valgrind, which must be installed. They are no
 times (a cache miss is not seen), but the same whatever else the machine does: they tell whether a change made anything cheaper.
@@ -88,8 +88,8 @@ SLICES = 20
 def steps_of(case: str, trains: int) -> int:
     """Steps of one repeat."""
     most = 2000 if case in IN_SUMO else 100
-    least = 10 if case in WORK else 100  # closing takes 30 us per train, once
-    return min(most, max(least, WORK.get(case, IN_SUMO_WORK) // trains))
+    minimum = 10 if case in WORK else 100  # closing takes 30 us per train, once
+    return min(most, max(minimum, WORK.get(case, IN_SUMO_WORK) // trains))
 
 
 # Scenarios
@@ -326,15 +326,15 @@ def inputs(folder: Path, case: str, trains: int, steps: int) -> None:
     from trainctl.stages.record import Journal
     from trainctl.sumo.session import LOGS, write_configuration, write_routes
 
-    prepared = open_scenario(str(folder / "scenario.toml"))
-    sumo_net.build(prepared.spec, folder)
+    model = open_scenario(str(folder / "scenario.toml"))
+    sumo_net.build(model.spec, folder)
 
     class Writer(Numeric):
         def start(self, start: Any) -> None:
             write_routes(start, folder / "trains.rou.xml")
 
-    Loop(prepared, Writer(prepared.line), Journal(folder, prepared))
-    configuration = write_configuration(folder, f"{prepared.spec.name}.net.xml", "trains.rou.xml", 1.0, steps + 1.0)
+    Loop(model, Writer(model.line), Journal(folder, model))
+    configuration = write_configuration(folder, f"{model.spec.name}.net.xml", "trains.rou.xml", 1.0, steps + 1.0)
     logs = [part for key, name in LOGS.items() for part in (f"--{key}", str(folder / name))]
     (folder / "command.json").write_text(json.dumps(["sumo", "-c", str(configuration), *logs]), encoding="utf-8")
     if case == "rail":
@@ -425,11 +425,11 @@ def closed(folder: Path, case: str) -> Case:
         from trainctl.controllers import emu_finite_time
 
         emu_finite_time.REHEARSAL_STEPS = 1  # the check of the start takes 10 ms per train, and is not what is measured
-    prepared = open_scenario(str(folder / "scenario.toml"))
+    model = open_scenario(str(folder / "scenario.toml"))
     clock = Clock()
-    journal = Journal(folder, prepared)
-    world: Any = open_world(prepared, folder, "sumo" if case in IN_SUMO else "numeric")
-    loop = Loop(prepared, world, journal)
+    journal = Journal(folder, model)
+    world: Any = open_world(model, folder, "sumo" if case in IN_SUMO else "numeric")
+    loop = Loop(model, world, journal)
     loop.step()  # compiles or loads what the kernels need
     clock.around(loop, "_measured", "read")
     clock.around(loop.topology, "step", "topology")
@@ -450,7 +450,7 @@ def closed(folder: Path, case: str) -> Case:
         world.close()
         journal.close()
 
-    return Case(len(prepared.scenario.ids), loop.step, close, clock)
+    return Case(len(model.scenario.ids), loop.step, close, clock)
 
 
 def public(folder: Path, case: str) -> Case:
@@ -599,7 +599,7 @@ def compared(root: Path, checkout: Path, sizes: list[int], cases: list[str], pai
 
 
 def paired(case: str, trains: int, pairs: list[dict[str, dict[str, Any]]]) -> dict[str, Any]:
-    """Median, least and greatest of the ratios within the pairs of one case."""
+    """Median, minimum and maximum of the ratios within the pairs of one case."""
     ratios = [pair["here"]["seconds"] / pair["there"]["seconds"] for pair in pairs]
     cpu = [pair["here"]["cpu"] / pair["there"]["cpu"] for pair in pairs]
     scale = 1e6 / trains
@@ -690,7 +690,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         "case": "case", "trains": "trains", "instructions": "instructions", "us_per_train_step": "us/train-step",
         "ratio_to_bare": "to bare", "cpu_us_per_train_step": "CPU us", "cpu_ratio_to_bare": "CPU to bare",
         "times_real_time": "x real time", "peak_mb": "peak MB", **{f"{p}_us": p for p in PARTS}, "pairs": "pairs",
-        "ratio": "here/there", "least_ratio": "least", "greatest_ratio": "greatest", "cpu_ratio": "CPU here/there",
+        "ratio": "here/there", "least_ratio": "minimum", "greatest_ratio": "maximum", "cpu_ratio": "CPU here/there",
         "here_us": "here us/train-step", "there_us": "there us/train-step",
     }  # fmt: skip
     columns = [c for c in named if c in rows[0]]

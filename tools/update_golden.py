@@ -31,9 +31,9 @@ def update(name: str, dry: bool) -> bool:
     """Renew one golden; True if anything moved."""
     place = GOLDENS / name
     with tempfile.TemporaryDirectory() as scratch:
-        prepared = open_scenario(name)
-        done = run(prepared, Path(scratch) / name)
-        time = prepared.scenario.run
+        model = open_scenario(name)
+        done = run(model, Path(scratch) / name)
+        time = model.scenario.run
         new = make_golden(done, Path(scratch) / "golden", every_s(time.duration_s, time.step_s))
         if place.exists():
             report = diff(place, new, EXACT)

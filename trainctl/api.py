@@ -40,9 +40,9 @@ if TYPE_CHECKING:
 
 #: What a run tells of itself in a notebook: metric -> words.
 HEADLINES = {
-    "bounds.broken": "kinds of bound broken",
-    "bounds.spacing_lower_margin_m": "least spacing above its lower bound [m]",
-    "bounds.spacing_upper_margin_m": "least room below the upper spacing bound [m]",
+    "bounds.broken": "kinds of bound violated",
+    "bounds.spacing_lower_margin_m": "minimum spacing above its lower bound [m]",
+    "bounds.spacing_upper_margin_m": "minimum room below the upper spacing bound [m]",
     "formation.settling_s": "all links within 1 m from [s]",
     "formation.final_error_m": "largest spacing error at the end [m]",
 }
@@ -135,7 +135,7 @@ class Plots:
         from trainctl.figures import trains as figures_trains
 
         with style.styled():
-            return sorted(catalogue.applicable(figures_trains.prepare(self._run, "double")))
+            return sorted(catalogue.applicable(figures_trains.drawable(self._run, "double")))
 
     def __getattr__(self, name: str) -> Callable[..., Figure]:
         from trainctl.figures import catalogue
@@ -198,13 +198,13 @@ class Simulation:
         out : Path, optional
             Run folder; default none, nothing stays.
         """
-        prepared = open_scenario(str(scenario), settings)
+        model = open_scenario(str(scenario), settings)
         with ExitStack() as stack:
             if out is None:
                 folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="trainctl."))) / "run"
             else:
                 folder = Path(out)
-            opened = runner.opened(prepared, folder, backend, force, ("trainctl.Simulation",))
+            opened = runner.opened(model, folder, backend, force, ("trainctl.Simulation",))
             simulation = stack.enter_context(opened)
             return cls(stack.pop_all(), simulation, Path(out) if out is not None else None)
 
@@ -226,7 +226,7 @@ class Simulation:
     @property
     def speed_mps(self) -> Floats:
         """Speed of every train's head, shape (n,)."""
-        return np.asarray(self._loop.state.own[self._loop.p.heads, SPEED].copy())
+        return np.asarray(self._loop.state.own[self._loop.p.leading, SPEED].copy())
 
     @property
     def track(self) -> list[str]:

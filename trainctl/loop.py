@@ -15,7 +15,7 @@ from trainctl.errors import LawError
 from trainctl.numeric import lay_out
 from trainctl.plants import disturbance
 from trainctl.railway.ways import under
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.scenario.tables import Event
 from trainctl.signals import POSITION, SPEED, Bools, Demand, Disturbed, Floats, Formed, Messages, Motion, Seen, Start
 from trainctl.stages import control, driver, orders, plant, protect, record, topology, traffic
@@ -34,7 +34,7 @@ class State(NamedTuple):
 
     k: int  # steps done
     own: Floats  # (U, 2 or 3) position [m], speed [m/s], force [N] of every unit
-    pending: tuple[int, ...]  # numbers of the orders to come
+    orders: orders.State
     traffic: traffic.State
     rule: Any  # of the formation rule: ``slots.State`` or ``convoys.State``
     formed: Formed
@@ -51,7 +51,7 @@ class Loop(Steps):
 
     Parameters
     ----------
-    prepared : Prepared
+    model : Model
         The scenario as arrays.
     world : World
         SUMO, or the numeric stand-in.
@@ -61,18 +61,18 @@ class Loop(Steps):
 
     state: State
 
-    def __init__(self, prepared: Prepared, world: World, journal: record.Journal) -> None:
-        super().__init__(prepared, journal)
+    def __init__(self, model: Model, world: World, journal: record.Journal) -> None:
+        super().__init__(model, journal)
         self.world = world
-        p, run = prepared, prepared.scenario.run
-        self.disturbances = disturbance.prepare(p.scenario.disturbance, p.scenario.ids, run.step_s, run.seed, p.worst)
+        p, run = model, model.scenario.run
+        self.disturbances = disturbance.signals(p.scenario.disturbance, p.scenario.ids, run.step_s, run.seed, p.worst)
         self.orders, self.traffic = orders.Orders(p, journal), traffic.Traffic(p, journal)
         self.topology = topology.Topology(p, journal)
         self.control, self.driver, self.plant = control.Control(p), driver.of(p), plant.of(p)
         self.protect = protect.Protect(p, journal, bool(len(self.disturbances.whole)) or self.plant.noisy)
         rule, formed = self.topology.rule.initial()
         self.state = State(
-            k=0, own=p.own.copy(), pending=self.orders.initial(), traffic=self.traffic.initial(), rule=rule, formed=formed,
+            k=0, own=p.own.copy(), orders=self.orders.initial(), traffic=self.traffic.initial(), rule=rule, formed=formed,
             messages=exchange.silent(), demand=self.control.initial(), memory=(),
             commanded=np.full(len(p.scenario.ids), np.nan), plant=self.plant.initial(), watch=self.record.initial(),
         )  # fmt: skip
@@ -80,16 +80,16 @@ class Loop(Steps):
 
     def after(self, s: State) -> State:
         """The state a step later."""
-        p, world, t, heads = self.p, self.world, self.time, self.p.heads
+        p, world, t, leading = self.p, self.world, self.time, self.p.leading
 
         # measure: SUMO -> where every train is on its way; its units follow, as a whole
         own = self._measured(s)
 
         # orders: new routes first, since they change the rows of everybody
-        pending, routes = self.orders.step(t, world.measure(), world.ways, own[heads, SPEED], s.formed.ahead, s.pending)
+        ordered, routes = self.orders.step(t, world.measure(), world.ways, own[leading, SPEED], s.formed.ahead, s.orders)
         for i, edges in routes:
             world.route(i, edges)
-        here, ways, speed = world.measure(), world.ways, own[heads, SPEED]
+        here, ways, speed = world.measure(), world.ways, own[leading, SPEED]
 
         # traffic: departures, stops -> entries; whose turn it is; what is ahead of every train, where anybody asks
         late = self.plant.overrun(own, p.driver_rules.service_mps2)
@@ -115,7 +115,7 @@ class Loop(Steps):
             s.k, t, own, self.plant.believed_resistance, formed, messages, s.demand, s.memory, s.commanded, acting
         )  # fmt: skip
         self._climb(own, formed, ways, here)
-        speed, acceleration = own[heads, SPEED], self.plant.acceleration(own)
+        speed, acceleration = own[leading, SPEED], self.plant.acceleration(own)
         driven, formed = self.driver.step(speed, acceleration, around, going, formed, s.commanded)
 
         # protect, plant: the supervisor tries the step without what disturbs it; the plant then takes it with
@@ -140,7 +140,7 @@ class Loop(Steps):
         world.move(moved.motion.displacement, p.scenario.run.step_s)
         formed = self.topology.rule.after(formed)
         return State(
-            s.k + 1, moved.own, pending, going, rule, formed, moved.messages, demand, memory, s.commanded, moved.state, watch
+            s.k + 1, moved.own, ordered, going, rule, formed, moved.messages, demand, memory, s.commanded, moved.state, watch
         )  # fmt: skip
 
     def end(self) -> None:
@@ -148,7 +148,7 @@ class Loop(Steps):
         s, world, t = self.state, self.world, self.time
         own, here, ways = self._measured(s), world.measure(), world.ways
         late = self.plant.overrun(own, self.p.driver_rules.service_mps2)
-        going, around = self.traffic.step(t, ways, here, own[self.p.heads, SPEED].copy(), late, s.traffic, last=True)
+        going, around = self.traffic.step(t, ways, here, own[self.p.leading, SPEED].copy(), late, s.traffic, last=True)
         seen = here._replace(position=here.position + s.formed.offset)
         rule, formed, messages, own, seen, scene = self.topology.step(
             t, seen, own, around, going, s.rule, s.formed, s.messages
@@ -172,7 +172,7 @@ class Loop(Steps):
 
     def order(self, event: Event) -> None:
         """Give an order from outside."""
-        self.state = self.state._replace(pending=(*self.state.pending, self.orders.add(event)))
+        self.state = self.state._replace(orders=self.orders.added(event, self.state.orders))
 
     def outcome(self) -> dict[str, Any]:
         """What run.json says of the finished run."""
@@ -181,7 +181,7 @@ class Loop(Steps):
     def _start(self) -> None:
         """Put the trains on the railway: those that are placed, and those due at time 0."""
         p, s, first = self.p, self.state, self.p.consists.first
-        speed = s.own[p.heads, SPEED].copy()
+        speed = s.own[p.leading, SPEED].copy()
         start = Start(
             ids=p.scenario.ids, edge=p.roster.edge, lane_position=p.roster.lane_position, speed=speed,
             length=p.consists.train_length(), unit_length=[p.consists.length[a:b] for a, b in pairwise(first)],
@@ -201,7 +201,7 @@ class Loop(Steps):
     def _measured(self, s: State) -> Floats:
         """SUMO owns where a train is: shift every train, as a whole, onto its measured front."""
         own = s.own.copy()
-        shift = self.world.measure().position + s.formed.offset - own[self.p.heads, POSITION]
+        shift = self.world.measure().position + s.formed.offset - own[self.p.leading, POSITION]
         own[:, POSITION] += np.repeat(shift, np.diff(self.p.consists.first))
         return own
 
@@ -237,7 +237,7 @@ class Loop(Steps):
         """Numbers must stay finite; a train never moves backwards."""
         motion = moved.motion
         if not (np.isfinite(moved.own).all() and np.isfinite(motion.displacement).all()):
-            finite = np.logical_and.reduceat(np.isfinite(moved.own).all(axis=1), self.p.heads)
+            finite = np.logical_and.reduceat(np.isfinite(moved.own).all(axis=1), self.p.leading)
             wrong = np.flatnonzero(~(finite & np.isfinite(motion.displacement))).tolist()
             names = ", ".join(self.p.scenario.ids[i] for i in wrong)
             before = [line for i in wrong if (line := self._acted(i, own, demand, motion))]
@@ -245,7 +245,7 @@ class Loop(Steps):
             raise LawError(f"the state of train {names} is no longer finite after {t:g} s: {why}")
         astray = np.flatnonzero(~(np.abs(moved.state.estimate) < ASTRAY).all(axis=1))
         if len(astray):
-            names = ", ".join(dict.fromkeys(self.p.scenario.ids[i] for i in np.searchsorted(self.p.heads, astray, "right") - 1))
+            names = ", ".join(dict.fromkeys(self.p.scenario.ids[i] for i in np.searchsorted(self.p.leading, astray, "right") - 1))
             raise LawError(f"the estimates of train {names} passed {ASTRAY:g} after {t:g} s: its observer diverged")
         for i in np.flatnonzero(motion.clipped).tolist():
             self.journal.event(t, "limit", train=self.p.scenario.ids[i], what="backwards", note="held at standstill")

@@ -27,9 +27,9 @@ from trainctl.numeric import Numeric
 from trainctl.record import checkpoint
 from trainctl.record.folder import (
     about_run,
-    claim,
     finish,
     held,
+    open_partial,
     ours,
     partial_of,
     plain,
@@ -39,8 +39,8 @@ from trainctl.record.folder import (
 )  # fmt: skip
 from trainctl.runs.run import Run
 from trainctl.scenario import promise, roster
-from trainctl.scenario.build import prepare
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.build import model_of
+from trainctl.scenario.model import Model
 from trainctl.scenario.reading import examine
 from trainctl.stages.record import Journal
 from trainctl.steps import Steps
@@ -51,7 +51,7 @@ Backend = Literal["sumo", "numeric"]
 
 
 def run(
-    p: Prepared,
+    p: Model,
     out: Path,
     backend: Backend = "sumo",
     force: bool = False,
@@ -64,7 +64,7 @@ def run(
 
     Parameters
     ----------
-    p : Prepared
+    p : Model
         The scenario, checked.
     out : Path
         Run folder; written as ``out.partial`` and renamed when complete.
@@ -102,7 +102,7 @@ def run(
 
 @contextmanager
 def opened(
-    p: Prepared,
+    p: Model,
     out: Path,
     backend: Backend = "sumo",
     force: bool = False,
@@ -123,7 +123,7 @@ def opened(
 
 @contextmanager
 def _opened(
-    p: Prepared, out: Path, backend: Backend, force: bool, command_line: Sequence[str], gui: str | None,
+    p: Model, out: Path, backend: Backend, force: bool, command_line: Sequence[str], gui: str | None,
     checkpoint_every_s: float | None,
 ) -> Iterator[Steps]:  # fmt: skip
     """The same for every run, whoever drives its trains."""
@@ -133,7 +133,7 @@ def _opened(
         raise InputError(f"--checkpoint-every {every:g}: must be a multiple of step_s = {step:g}")
     if every is not None and gui is not None:
         raise InputError("--checkpoint-every: a run that is watched cannot be resumed; leave out --gui")
-    partial = claim(out, force)
+    partial = open_partial(out, force)
     with held(partial):
         text = p.scenario.toml()
         protection = {"protection": promise.told(p)} if p.supervision.mode != "off" and not p.self_driven else {}
@@ -204,7 +204,7 @@ def resume(folder: Path, progress: Callable[[int, int], Any] | None = None) -> t
 
 @contextmanager
 def _driven(
-    p: Prepared, partial: Path, info: dict[str, Any], gui: str | None, every_s: float | None, saved: checkpoint.Saved | None
+    p: Model, partial: Path, info: dict[str, Any], gui: str | None, every_s: float | None, saved: checkpoint.Saved | None
 ) -> Iterator[Steps]:
     """The loop in its folder, from the beginning or from a checkpoint, and what is left to do when it has ended."""
     place = partial / checkpoint.FOLDER
@@ -266,7 +266,7 @@ def _driven(
         raise
 
 
-def _complete(p: Prepared, partial: Path, info: dict[str, Any], done: dict[str, Any], journal: Journal | None = None) -> None:
+def _complete(p: Model, partial: Path, info: dict[str, Any], done: dict[str, Any], journal: Journal | None = None) -> None:
     """Join the tables, measure, and say that the run is complete; may be done again after a kill."""
     if journal is None:
         Journal(partial, p, done["recorder"]).close()
@@ -326,13 +326,13 @@ def _stops() -> Iterator[_Stop]:
             signal.signal(number, handler)
 
 
-def keep_law(p: Prepared, folder: Path) -> None:
+def keep_law(p: Model, folder: Path) -> None:
     """A law that came as a file stands beside the scenario that names it."""
     if p.scenario.controller.law.endswith(".py"):
         (folder / p.scenario.controller.law).write_bytes(p.law.SOURCE)
 
 
-def begin(partial: Path, p: Prepared, every_s: float | None) -> None:
+def begin(partial: Path, p: Model, every_s: float | None) -> None:
     """Put down what ``again`` needs, with the network as it was read."""
     place = partial / checkpoint.FOLDER
     place.mkdir()
@@ -347,7 +347,7 @@ def begin(partial: Path, p: Prepared, every_s: float | None) -> None:
     checkpoint.replace(place / checkpoint.START, json.dumps(start).encode())
 
 
-def again(partial: Path) -> tuple[Prepared, float | None]:
+def again(partial: Path) -> tuple[Model, float | None]:
     """The scenario of a run folder, ready to run, and its ``checkpoint_every_s``."""
     place = partial / checkpoint.FOLDER
     try:
@@ -369,7 +369,7 @@ def again(partial: Path) -> tuple[Prepared, float | None]:
     scenario, found = examine(data, resolved=True)
     if scenario is None:
         raise InputError([f"{partial / 'scenario.toml'}: {line}" for line in found])
-    p = prepare(scenario, start["file"], place, found, enrolled)
+    p = model_of(scenario, start["file"], place, found, enrolled)
     original = p.scenario.model_copy(update={"network": type(p.scenario.network)(**network)})
     p = dataclasses.replace(p, scenario=original)
     if p.scenario.toml() != text:
@@ -377,7 +377,7 @@ def again(partial: Path) -> tuple[Prepared, float | None]:
     return p, start["checkpoint_every_s"]
 
 
-def open_world(p: Prepared, folder: Path, backend: Backend, gui: str | None = None) -> World:
+def open_world(p: Model, folder: Path, backend: Backend, gui: str | None = None) -> World:
     """The simulator behind the loop; SUMO's inputs and logs go to ``folder/sumo``.
 
     ``gui`` names a program that is driven over TraCI and shown the links instead of libsumo: "sumo-gui", or "sumo" for the same
@@ -395,14 +395,14 @@ def open_world(p: Prepared, folder: Path, backend: Backend, gui: str | None = No
     return Sumo(p.line, net, place, run.step_s, run.steps, run.record_every_s)
 
 
-def open_self_driven(p: Prepared, folder: Path) -> SelfDriven:
+def open_self_driven(p: Model, folder: Path) -> SelfDriven:
     """SUMO with its own drivers; its inputs and logs go to ``folder/sumo``."""
     from trainctl.sumo.baseline import Baseline
 
     return Baseline(p, *_net(p, folder))
 
 
-def _net(p: Prepared, folder: Path) -> tuple[Path, Path]:
+def _net(p: Model, folder: Path) -> tuple[Path, Path]:
     """The net for SUMO, and the folder it lies in."""
     place = folder / "sumo"
     place.mkdir()

@@ -166,6 +166,15 @@ def leader_at(reference: Reference, t: float, inside: float, out: Floats) -> Non
     evaluate(reference.breaks, reference.position, t, inside, out)
 
 
+@njit(cache=True)
+def leader_over(reference: Reference, times: Floats) -> Floats:
+    """Position, speed, acceleration and jerk of the virtual leader at ``times`` (k,), the later side of a jump: (4, k)."""
+    out = np.empty((len(times), 4))
+    for k in range(len(times)):
+        evaluate(reference.breaks, reference.position, times[k], times[k], out[k])
+    return np.ascontiguousarray(out.T)
+
+
 class Trains(NamedTuple):
     """What each train knows of itself when a sampled law is evaluated, shape (n,)."""
 
@@ -331,10 +340,10 @@ class Reliance(NamedTuple):
     """What protection may rely on of every train, shape (n,)."""
 
     braking: Floats  # m/s2, what brakes, faults and slope leave of the braking that is ordered
-    pull: Floats  # m/s2, greatest force per mass at the greatest speed; inf if there is no limit
+    pull: Floats  # m/s2, maximum force per mass at the maximum speed; inf if there is no limit
     bias: Floats  # m/s2, what faulty actuators add to the input
     late: Floats  # m/s2, how much running resistance may fall until actuators have followed
-    noise: Floats  # m/s2, greatest of the plant's own
+    noise: Floats  # m/s2, maximum of the plant's own
     lag: Floats  # s, of actuators
 
 
@@ -360,7 +369,7 @@ class Plant(Protocol):
         """Time for which a sample of the plant's own noise is held [s]; None: it has none, and needs no seed."""
 
     def room(self, consists: Consists, lower: Floats, upper: Floats) -> tuple[Floats, Floats]:
-        """Least and greatest input [m/s2], (n,) each, every train can give in the speed band ``lower`` to ``upper`` (n,)."""
+        """Minimum and maximum input [m/s2], (n,) each, every train can give in the speed band ``lower`` to ``upper`` (n,)."""
 
     def sure_braking(self, params: Any, consists: Consists, top: Floats) -> Floats:
         """Deceleration [m/s2], (n,), every train can give on the level at any speed up to ``top`` (n,); inf if unlimited."""
@@ -531,7 +540,7 @@ class Row(NamedTuple):
     seen: Seen
     track: Ints  # (n,)
     own: Floats  # (U, s)
-    speed: Floats  # (n,) m/s, of the heads
+    speed: Floats  # (n,) m/s, of the leading units
     ahead: Ints  # (n,) train ahead in the formation, -1 for the first
     links: Links
     motion: Motion | None

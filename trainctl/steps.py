@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.stages.record import Journal, Record
 
 
@@ -15,7 +15,7 @@ class Steps(ABC):
 
     Parameters
     ----------
-    prepared : Prepared
+    model : Model
         The scenario as arrays.
     journal : Journal
         Where rows and events go.
@@ -23,8 +23,8 @@ class Steps(ABC):
 
     state: Any
 
-    def __init__(self, prepared: Prepared, journal: Journal) -> None:
-        self.p, self.journal, self.record = prepared, journal, Record(prepared, journal)
+    def __init__(self, model: Model, journal: Journal) -> None:
+        self.p, self.journal, self.record = model, journal, Record(model, journal)
         self.not_entered = 0
         self.between: Callable[[], Any] | None = None  # called after every step
 

@@ -208,7 +208,7 @@ def test_its_lead_is_how_it_moves(any_plant: Any) -> None:
 
 
 def test_it_can_brake_as_it_says(any_plant: Any) -> None:
-    """Every unit braking with its own share at the greatest speed gives no less, and is not limited; a little more is."""
+    """Every unit braking with its own share at the maximum speed gives no less, and is not limited; a little more is."""
     scene, params = at_rest(any_plant.STATES, **BRAKES), clamped(any_plant)
     sure = any_plant.sure_braking(params, scene.consists, TOP)
     assert sure.shape == (TRAINS,) and (sure > 0.0).all()

@@ -215,8 +215,8 @@ def test_the_step_that_is_said_to_work_works_from_nearly_all_random_starts() -> 
             alpha_1=float(generator.choice([0.7, 0.9, 1.0])), p_1=generator.uniform(10, 40), p_3=generator.uniform(5, 20),
             mu_1=generator.uniform(0.02, 0.1), mu_2=generator.uniform(0.05, 0.3),
         )  # fmt: skip
-        heads = (109e3 + offset[0], 106e3 - 80.0 * units + offset[1])
-        scene = group(2, units, heads=heads, speeds=tuple(SPEEDS[0] + generator.uniform(-12.0, 12.0, 2)))
+        leading = (109e3 + offset[0], 106e3 - 80.0 * units + offset[1])
+        scene = group(2, units, leading=leading, speeds=tuple(SPEEDS[0] + generator.uniform(-12.0, 12.0, 2)))
         per_second = int(np.ceil(1.0 / law.largest_sub_step(params, scene)))
         coarse, fine = (run(scene, 20, params, step=1.0 / (k * per_second)) for k in (1, 8))
         wrong += not np.abs(coarse.own[-1] - fine.own[-1])[:, 1].max() < 1e-2
@@ -232,8 +232,8 @@ def test_4000_s_take_at_most_3_s(example: History) -> None:
 @pytest.mark.parametrize(("plant_under", "times"), [("train-level law", 100.0), ("finite-time law", 40.0)])
 def test_a_hundred_trains_of_eight_run_faster_than_real_time(plant_under: str, times: float) -> None:
     generator = np.random.default_rng(1)
-    heads = 400e3 - 3640.0 * np.arange(100) + generator.normal(0.0, 50.0, 100)
-    scene = group(100, 8, plant_under == "train-level law", 400e3, tuple(heads), tuple(80.0 + generator.normal(0.0, 1.0, 100)))
+    leading = 400e3 - 3640.0 * np.arange(100) + generator.normal(0.0, 50.0, 100)
+    scene = group(100, 8, plant_under == "train-level law", 400e3, tuple(leading), tuple(80.0 + generator.normal(0.0, 1.0, 100)))
     scene = scene._replace(reference=Reference(np.array([0.0, 1e4]), np.array([[400e3, 80.0]])))
     if plant_under == "finite-time law":
         assert law.violations(law.Params(), scene) == []

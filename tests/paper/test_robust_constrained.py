@@ -178,7 +178,7 @@ def test_worst_case_of_a_scenario_attains_the_bound_with_measurement_noise_too()
         {**t, "shape": "worst_case", "pair": [1, 4], "peak_s": 1000.0}
         for t in [*PRINTED, {"on": "measurement", "amplitude_m": 0.5, "shape": "constant"}]
     ]
-    signals = disturbance.prepare(entries(tables), start.trains, T, None, partial(law.worst, PARAMS, start))
+    signals = disturbance.signals(entries(tables), start.trains, T, None, partial(law.worst, PARAMS, start))
     bound = law.analysis(PARAMS, start, entries(tables)).gain
     assert bound is not None
     assert bound.worst_pair == ("1", "4")
@@ -201,7 +201,7 @@ def random_signals(rng: np.random.Generator, copies: int) -> disturbance.Signals
             if shape in ("sine", "square"):
                 table |= {"period_s": float(10 ** rng.uniform(0.4, 3)), "phase_rad": float(rng.uniform(0, 6))}
             found.append(table)
-    return disturbance.prepare(entries(found), [str(i + 1) for i in range(N * copies)], T, int(rng.integers(2**32)))
+    return disturbance.signals(entries(found), [str(i + 1) for i in range(N * copies)], T, int(rng.integers(2**32)))
 
 
 def largest_error_over_bound(graph: str, copies: int, seed: int) -> tuple[float, float]:
@@ -303,9 +303,9 @@ def test_assumption_2_needs_weights_of_millionths() -> None:
 def test_system_matrix_is_not_stochastic_yet_the_spread_falls() -> None:
     """(16) along the undisturbed example with c = 2/h: negative elements for 55 steps, so Lemma 2 does not explain why it works."""
     scaled = along_the_example()  # which asserts (12) in every step
-    negative, least = scaled.negative(2 / 0.3)
+    negative, minimum = scaled.negative(2 / 0.3)
     assert negative == 55
-    assert least == pytest.approx(-0.116, abs=1e-3)
+    assert minimum == pytest.approx(-0.116, abs=1e-3)
     assert scaled.rho2.min() == pytest.approx(0.034, abs=1e-3)
     assert np.all(np.diff(scaled.spreads(2 / 0.3)) <= 1e-9)
 
@@ -316,9 +316,9 @@ def test_negative_elements_are_those_of_the_matrix_written_out() -> None:
     for c in (1.0, 2 / 0.3, 100.0):
         own = scaled.rho1[k] * (1 - scaled.rho2[k] * 0.3 * T)
         lower_left = np.diag(1 - T / c - own) - c * T * np.diag(scaled.rho1[k] * scaled.rho2[k]) @ scaled.laplacian
-        least = min(1 - T / c, T / c, lower_left.min(), (T / c + own).min())
+        minimum = min(1 - T / c, T / c, lower_left.min(), (T / c + own).min())
         assert scaled._replace(**{n: getattr(scaled, n)[k : k + 1] for n in ("rho1", "rho2")}).negative(c)[1] == pytest.approx(
-            least
+            minimum
         )
 
 
@@ -362,12 +362,12 @@ def savable_starts(rng: np.random.Generator, count: int) -> tuple[Floats, Floats
 
 def collisions(graph: Edges, p: Floats, v: Floats) -> tuple[int, float]:
     loop = Loop(scene([graph] * len(p), p.ravel(), v.ravel()))
-    least = np.full(len(p), np.inf)
+    minimum = np.full(len(p), np.inf)
     for _ in range(600):
         loop.step()
         x = loop.own[:, POSITION].reshape(-1, N)
-        least = np.minimum(least, (x[:, :-1] - x[:, 1:]).min(axis=1))
-    return int((least <= 0.0).sum()), float(least.min())
+        minimum = np.minimum(minimum, (x[:, :-1] - x[:, 1:]).min(axis=1))
+    return int((minimum <= 0.0).sum()), float(minimum.min())
 
 
 @pytest.mark.campaign
@@ -379,8 +379,8 @@ def test_graphs_without_the_predecessor_collide_from_savable_starts() -> None:
         "line": LINE, "cycle": CYCLE, "cycle against the traffic": [(b, a) for a, b in CYCLE],
         "line forward, 1 hears 3, 4 hears 3": [(1, 0), (2, 1), (3, 2), (0, 2), (2, 3)],
     }.items():  # fmt: skip
-        found[name], least = collisions(graph, p, v)
-        print(f"{name}: {found[name]} of 2000 end in a collision, least spacing {least:.0f} m")
+        found[name], minimum = collisions(graph, p, v)
+        print(f"{name}: {found[name]} of 2000 end in a collision, minimum spacing {minimum:.0f} m")
     assert found["line"] == found["cycle"] == 0
     assert found["cycle against the traffic"] > 0
 

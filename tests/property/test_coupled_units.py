@@ -110,13 +110,13 @@ def test_shared_forces_sum_to_the_train_s_and_keep_the_limits(
         consists.rotating * acceleration + consists.davis[:, 0] + consists.davis[:, 1] * v + consists.davis[:, 2] * v**2
     )
     most = np.minimum(consists.traction, consists.traction_power / v)
-    least = -np.minimum(consists.braking, consists.braking_power / v)
+    minimum = -np.minimum(consists.braking, consists.braking_power / v)
     for i in range(2):
         rows = slice(consists.first[i], consists.first[i + 1])
         out = np.empty(rows.stop - rows.start)
         shared.demand(i, held, np.zeros(4), 0.0, 0.0, own[rows], table, table, row, table, out)
         assert out.sum() == pytest.approx(base[rows].sum(), rel=1e-9, abs=1e-6 * np.abs(out).sum())
-        if np.all((base[rows] <= most[rows]) & (base[rows] >= least[rows])):
+        if np.all((base[rows] <= most[rows]) & (base[rows] >= minimum[rows])):
             assert not coupled_units.limit(i, plant, own[rows], out)
 
 

@@ -99,9 +99,9 @@ def batch(
     def room(shift: Floats, move: Floats) -> Floats:
         e, m = shift[a] - shift[b], move[a] - move[b]
         reach = np.where(m > 0, over - e, under + e)
-        least = np.full(cases, np.inf)
-        np.minimum.at(least, edge_case, np.maximum(reach, 0.0) / np.maximum(np.abs(m), 1e-300))
-        return least
+        minimum = np.full(cases, np.inf)
+        np.minimum.at(minimum, edge_case, np.maximum(reach, 0.0) / np.maximum(np.abs(m), 1e-300))
+        return minimum
 
     wish = rng.normal(size=n)
     z_error = wish * (share(rng, cases) * room(np.zeros(n), wish))[case]
@@ -126,8 +126,8 @@ class Extremes(NamedTuple):
     input: Floats  # (n,) m/s2
     bound: dict[str, int]  # train-steps in which alpha, beta, eta was what limited s
     own: Floats
-    error: Floats  # (E,) m, greatest |x_ab - d_ab| of the last 50 periods
-    ripple: Floats  # (n,) m/s, greatest |v - v_r| of the last 50 periods
+    error: Floats  # (E,) m, maximum |x_ab - d_ab| of the last 50 periods
+    ripple: Floats  # (n,) m/s, maximum |v - v_r| of the last 50 periods
 
 
 def beyond(value: Floats, lower: Floats, upper: Floats) -> Floats:
@@ -215,8 +215,8 @@ def join(b: Batch, seed: int) -> tuple[Batch, Edges]:
     )  # fmt: skip
     z = scene.own[:, POSITION] + (1 - sc.lead) * scene.own[:, SPEED] * sc.control_period
     now, ahead = (q[edges.a] - q[edges.b] for q in (scene.own[:, POSITION], z))
-    least, most = np.minimum(now, ahead), np.maximum(now, ahead)
-    promised = edges._replace(lower=np.minimum(edges.lower, least), upper=np.maximum(edges.upper, most))
+    minimum, most = np.minimum(now, ahead), np.maximum(now, ahead)
+    promised = edges._replace(lower=np.minimum(edges.lower, minimum), upper=np.maximum(edges.upper, most))
     return Batch(scene, edges, np.concatenate([b.case, np.arange(cases)]), slot), promised
 
 
@@ -243,14 +243,14 @@ def binding(scene: Scene, own_speed: bool, trains: Trains, acceleration: Floats)
     np.add.at(wanted, links.receiver, e - links.desired)
     wanted /= 2 * np.diff(links.first)
     f, F = (point.resistance(v, scene.consists.davis) for v in (b.speed_lower, b.speed_upper))
-    most, least = b.speed_upper, b.speed_lower
+    most, minimum = b.speed_upper, b.speed_lower
     if own_speed:
         f = F = trains.resistance
-        most = least = trains.speed
+        most = minimum = trains.speed
     ends = {
         "alpha": (back, forth),
         "beta": ((b.speed_lower - V_R) * T, (b.speed_upper - V_R) * T),
-        "eta": (most * T + (b.input_lower - f) * T**2 - V_R * T, least * T + (b.input_upper - F) * T**2 - V_R * T),
+        "eta": (most * T + (b.input_lower - f) * T**2 - V_R * T, minimum * T + (b.input_upper - F) * T**2 - V_R * T),
     }
     acted = (np.abs(s - wanted) > 1e-6) & (np.abs(s) > 1e-6)
     return {name: int(np.sum(acted & (np.minimum(np.abs(s - lo), np.abs(s - hi)) < 1e-9))) for name, (lo, hi) in ends.items()}

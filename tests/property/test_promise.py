@@ -27,7 +27,7 @@ def assumed(rng: np.random.Generator, step: float, *, disturbed: bool, lag: bool
 def least_gap(
     relied: Assumed, believed: Assumed, step: float, theta: float, seed: int, seconds: float = 250.0
 ) -> tuple[float, float]:
-    """Least gap and greatest overspeed of pairs whose trains do the worst that ``relied`` allows, judged by what is ``believed``."""
+    """Minimum gap and maximum overspeed of pairs whose trains do the worst that ``relied`` allows, judged by what is ``believed``."""
     rng = np.random.default_rng(seed)
     n = 2 * PAIRS
     lead, follow = np.arange(PAIRS), np.arange(PAIRS, n)
@@ -40,7 +40,7 @@ def least_gap(
     needed = supervisor.stopping_distance(quick[follow], relied.braking[follow], step, theta) - away
     slack = rng.choice([0.0, 0.0, 300.0], PAIRS)
     gap = RULES.margin_m + 2.0 * (relied.uncertainty[lead] + relied.uncertainty[follow]) + np.maximum(needed, 0.0) + slack
-    least, over = np.inf, -np.inf
+    minimum, over = np.inf, -np.inf
     for k in range(int(seconds / step)):
         error = rng.choice([-1.0, 1.0], n) * relied.uncertainty
         room = gap + error[lead] - error[follow]
@@ -67,8 +67,8 @@ def least_gap(
             ways, v = ((1.0 - theta) * v + theta * after) * step, after
         ways += np.where(v > 0.0, push * step, 0.0)
         gap = gap + ways[lead] - ways[follow]
-        least, over = min(least, gap.min()), max(over, v.max() - LIMIT)
-    return float(least), float(over)
+        minimum, over = min(minimum, gap.min()), max(over, v.max() - LIMIT)
+    return float(minimum), float(over)
 
 
 CASES = [(0.0, 1.0, False), (0.5, 1.0, False), (0.5, 0.2, False), (0.0, 5.0, False), (0.5, 1.0, True), (0.5, 0.5, True)]
@@ -78,8 +78,8 @@ CASES = [(0.0, 1.0, False), (0.5, 1.0, False), (0.5, 0.2, False), (0.0, 5.0, Fal
 @pytest.mark.parametrize("disturbed", [False, True])
 def test_what_is_assumed_is_enough(theta, step, lag, disturbed):
     relied = assumed(np.random.default_rng(7), step, disturbed=disturbed, lag=lag)
-    least, over = least_gap(relied, relied, step, theta, 1)
-    assert least > RULES.margin_m - 0.5 * lag - 1e-6
+    minimum, over = least_gap(relied, relied, step, theta, 1)
+    assert minimum > RULES.margin_m - 0.5 * lag - 1e-6
     assert over < 1e-6 + 0.1 * lag + 2.0 * relied.blur
 
 
@@ -90,5 +90,5 @@ def test_each_assumption_matters(forgotten):
     perfect = supervisor.as_ordered(RULES.emergency_mps2, 2 * PAIRS)
     believed = relied._replace(**{forgotten: getattr(perfect, forgotten)})
     enough, _ = least_gap(relied, relied, 1.0, 0.5, 1)
-    least, _ = least_gap(relied, believed, 1.0, 0.5, 1)
-    assert enough > RULES.margin_m - 0.5 > least
+    minimum, _ = least_gap(relied, believed, 1.0, 0.5, 1)
+    assert enough > RULES.margin_m - 0.5 > minimum

@@ -149,10 +149,10 @@ def entries(draw: st.DrawFn) -> disturbance.Disturbance:
 @given(st.lists(entries(), max_size=4), st.integers(0, 2**63), st.integers(0, 500))
 def test_a_disturbance_never_exceeds_what_it_says(found: list[disturbance.Disturbance], seed: int, k: int) -> None:
     ids = ["a", "b", "c"]
-    signals = disturbance.prepare(found, ids, 0.4, seed)
+    signals = disturbance.signals(found, ids, 0.4, seed)
     where = np.array([-60.0, 0.0, 30.0])
     first, again = (disturbance.at(signals, k, 0.4 * k, where) for _ in range(2))
-    most = sum((e.greatest(ids)[disturbance.SPEED] for e in found), np.zeros(3))
+    most = sum((e.maximum(ids)[disturbance.SPEED] for e in found), np.zeros(3))
     assert np.all(np.abs(first.speed) <= most + 1e-9)
     np.testing.assert_array_equal(first.speed, again.speed)
     steady = [e.steady(ids) for e in found]

@@ -106,15 +106,15 @@ def start(
 
 
 def ended(world: World, x: np.ndarray) -> Targets:
-    heads = np.flatnonzero(world.first)
-    return fixed(heads, world.end - x[heads], END)
+    leading = np.flatnonzero(world.first)
+    return fixed(leading, world.end - x[leading], END)
 
 
 CASES = [(0.0, 0.2), (0.5, 0.2), (0.0, 1.0), (0.5, 1.0), (0.0, 2.0), (0.5, 0.7), (0.25, 0.5)]
 
 
 def driven(seed: int, columns: int, params: Params, step: float, theta: float, seconds: float) -> float:
-    """Least distance to the train ahead in a run of all drivers; every step is checked."""
+    """Minimum distance to the train ahead in a run of all drivers; every step is checked."""
     rng = np.random.default_rng(seed)
     world, x, v = start(rng, columns, params, step, theta)
     rows, least_gap = np.flatnonzero(~world.first), np.inf
@@ -122,8 +122,8 @@ def driven(seed: int, columns: int, params: Params, step: float, theta: float, s
         targets, limits = joined(behind(world, x, v), ended(world, x)), limits_of(world, x)
         verdict = supervisor.verdict(params, v, targets, limits, step, theta)
         a, _ = supervisor.applied(verdict, demanded(rng, k, len(v)))
-        assert np.all(verdict.least <= verdict.greatest) and np.all(verdict.least >= -params.emergency_mps2)
-        assert np.all((a >= verdict.least) & (a <= verdict.greatest)) and np.all(a <= params.greatest_mps2)
+        assert np.all(verdict.minimum <= verdict.maximum) and np.all(verdict.minimum >= -params.emergency_mps2)
+        assert np.all((a >= verdict.minimum) & (a <= verdict.maximum)) and np.all(a <= params.greatest_mps2)
         assert np.all(v + a * step >= -1e-12)  # never backwards
         x, v = moved(x, v, a, step, theta)
         gap = x[rows - 1] - world.length[rows - 1] - x[rows]
@@ -148,7 +148,7 @@ def test_a_gap_that_begins_below_the_margin_behind_a_faster_train_does_not_shrin
     params, rng = Params(mode="on"), np.random.default_rng(2)
     v, w = rng.uniform(0.0, 30.0, 500), rng.uniform(30.0, 60.0, 500)
     gap = rng.uniform(0.0, 20.0, 500)
-    least, rows = np.minimum(gap, 20.0), np.arange(500)
+    minimum, rows = np.minimum(gap, 20.0), np.arange(500)
     enough = supervisor.stopping_distance(w, 1.0, step, theta) - supervisor.stopping_distance(v, 1.0, step, theta) + gap >= 20.0
     for k in range(int(150 / step)):
         ahead = Targets(rows, gap, w, np.ones(500, bool), np.full(500, TRAIN), np.full(500, -1))
@@ -159,8 +159,8 @@ def test_a_gap_that_begins_below_the_margin_behind_a_faster_train_does_not_shrin
         )
         own_way, v = moved(np.zeros(500), v, a, step, theta)
         gap = gap + its_way - own_way
-        assert np.all((gap >= least - ROUNDING)[enough])
-        least = np.maximum(least, np.minimum(gap, 20.0))
+        assert np.all((gap >= minimum - ROUNDING)[enough])
+        minimum = np.maximum(minimum, np.minimum(gap, 20.0))
 
 
 @pytest.mark.campaign
@@ -231,7 +231,7 @@ def test_points_are_reached_and_not_passed_and_the_train_starts_again_when_they_
         assert np.all(v < 1e-6) and np.all(at - x < keeps + 1e-3), KINDS[kind]
         assert hardest > (-0.7 if kind == STOP else -1.0) - 1e-6
         verdict = supervisor.verdict(params, v, supervisor.no_targets(), supervisor.no_limits(), step, theta)
-        assert np.all(verdict.greatest == params.greatest_mps2)
+        assert np.all(verdict.maximum == params.greatest_mps2)
 
 
 @pytest.mark.parametrize(("theta", "step"), CASES)
@@ -263,16 +263,16 @@ def test_the_greatest_acceleration_is_the_greatest_that_is_safe(theta, step):
     way = [supervisor.stopping_distance(s, 1.0, step, theta) for s in (v, w)]
     room = 20.0 + np.maximum(0.0, way[0] - way[1]) + rng.exponential(50.0, 4000)
     targets = Targets(np.arange(4000), room, w, np.ones(4000, bool), np.full(4000, TRAIN), np.full(4000, -1))
-    greatest = supervisor.verdict(params, v, targets, supervisor.no_limits(), step, theta).greatest
+    maximum = supervisor.verdict(params, v, targets, supervisor.no_limits(), step, theta).maximum
     for extra, safe in ((0.0, True), (1e-3, False)):
         at, speed, rear, ahead = np.zeros(4000), v.copy(), room.copy(), w.copy()
-        at, speed = moved(at, speed, greatest + extra, step, theta)
+        at, speed = moved(at, speed, maximum + extra, step, theta)
         rear, ahead = moved(rear, ahead, np.full(4000, -1.0), step, theta)
-        least = rear - at
+        minimum = rear - at
         for _ in range(int(400 / step)):
             at, speed = moved(at, speed, np.full(4000, -1.0), step, theta)
             rear, ahead = moved(rear, ahead, np.full(4000, -1.0), step, theta)
-            least = np.minimum(least, rear - at)
-        kept = least > 20.0 - 1e-7
-        moves = (v + greatest * step > 0.0) & (greatest < 50.0)
+            minimum = np.minimum(minimum, rear - at)
+        kept = minimum > 20.0 - 1e-7
+        moves = (v + maximum * step > 0.0) & (maximum < 50.0)
         assert np.all(kept) if safe else not np.any(kept & moves & (theta > 0.0)) and np.mean(kept[moves]) < 0.05

@@ -102,7 +102,7 @@ def test_headways_are_those_of_sumo_without_us(tmp_path: Path, block: str, signa
 @pytest.mark.campaign
 @pytest.mark.parametrize("block", ["fixed", "moving"])
 def test_the_rows_of_the_capacity_table_are_those_of_sumo_without_us(tmp_path: Path, block: str) -> None:
-    plan, row = capacity.Plan(), f"{block}_block"
+    plan, row = capacity.CapacityPlan(), f"{block}_block"
     capacity.prepare_files(plan, tmp_path, [row])
     ours = capacity.one(tmp_path / f"{row}.toml", tmp_path / row, plan)
     net = tmp_path / row / "sumo" / "capacity.net.xml"
@@ -251,7 +251,7 @@ def test_signals_that_cannot_stand_are_found_before_the_run(tmp_path: Path) -> N
 
 
 def test_what_sumo_would_not_feel_is_refused() -> None:
-    from trainctl.scenario.build import prepare
+    from trainctl.scenario.build import model_of
     from trainctl.scenario.reading import read
 
     data, path = read("fault_tolerant")
@@ -259,7 +259,7 @@ def test_what_sumo_would_not_feel_is_refused() -> None:
     checked, found = examine(data)
     assert checked is not None
     with pytest.raises(InputError, match="fault: SUMO's own trains take none"):
-        prepare(checked, path.name, path.parent, found)
+        model_of(checked, path.name, path.parent, found)
 
 
 def test_a_net_has_the_signals_it_has() -> None:

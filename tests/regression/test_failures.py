@@ -187,7 +187,7 @@ def test_a_continuous_law_that_gives_nan(tmp_path):
     ):
         for _ in range(3):
             s.step()
-        s.state.plant.estimate[prepared.heads[1], 2] = np.nan  # its observer went astray
+        s.state.plant.estimate[prepared.leading[1], 2] = np.nan  # its observer went astray
         s.step()
     assert failure(tmp_path / "run.partial")[1:] == (3.0, "failed")
     assert Run(tmp_path / "run.partial").trains.time_s.max() == 2

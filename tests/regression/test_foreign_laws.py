@@ -40,7 +40,7 @@ def test_a_law_on_actuated_units_without_an_observer_runs(law, tmp_path):
     assert units[["fault_estimate_mps3", "acceleration_estimate_mps2"]].isna().all(axis=None)
     at_work = units[units.time_s < 20.0]
     assert at_work[["law_input", "fault_mps3", "acceleration_mps2"]].notna().all(axis=None)
-    figures = catalogue.applicable(figures_trains.prepare(trainctl.open(done.folder), "double"))
+    figures = catalogue.applicable(figures_trains.drawable(trainctl.open(done.folder), "double"))
     assert "unit_forces" in figures and not [name for name in figures if name.endswith("_estimates")]
 
 

@@ -31,7 +31,7 @@ def kinds(run: Run) -> Counter[str]:
 
 
 def unharmed(run: Run, arrive: bool = True) -> None:
-    """No collision, no teleport, no word from SUMO, no bound broken, no emergency, and every train arrives."""
+    """No collision, no teleport, no word from SUMO, no bound violated, no emergency, and every train arrives."""
     sumo = run.folder / "sumo"
     assert "<collision " not in (sumo / "collisions.xml").read_text()
     assert 'teleports total="0"' in (sumo / "statistics.xml").read_text()

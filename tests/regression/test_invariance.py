@@ -45,7 +45,7 @@ def trajectories(data: dict[str, Any], folder: Path, begin_m: float = 0.0, line:
 
 
 def apart(one: dict[str, Any], other: dict[str, Any]) -> float:
-    """Greatest difference of positions [m] and speeds [m/s]."""
+    """Maximum difference of positions [m] and speeds [m/s]."""
     assert one.keys() == other.keys()
     return max(float(np.abs(one[name] - other[name]).max()) for name in one)
 

@@ -90,7 +90,7 @@ def test_emu_group_in_sumo_for_4000_s(finished):
     speed = by_train(run, "speed_mps")
     for time, level in ((590.0, 316 / 3.6), (1990.0, 342 / 3.6), (4000.0, 324 / 3.6)):
         assert speed.loc[time].to_numpy() == pytest.approx(level, abs=0.02), time
-    # Without force limits the start, and later the step of the reference, overshoot the line's 100 m/s; nothing else is broken.
+    # Without force limits the start, and later the step of the reference, overshoot the line's 100 m/s; nothing else is violated.
     told = [e for e in run.events if e["kind"] in ("violation", "sumo_warning")]
     assert sorted((e["bound"], e["who"]) for e in told) == [("line_speed_mps", train) for train in "123"]
     assert told[0]["time_s"] == speed.index[(speed > 100.0).any(axis=1)][0]

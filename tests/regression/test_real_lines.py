@@ -40,7 +40,7 @@ braking_n = 64000.0
 actuator_rate_per_s = 2.0
 """
 
-#: Distances of a formation 1 km apart; the speed gain of the heads and the one between trains are not the paper's.
+#: Distances of a formation 1 km apart; the speed gain of the leading units and the one between trains are not the paper's.
 FINITE_TIME = """
 law = "emu_finite_time"
 mu_2 = 1.0
@@ -107,7 +107,7 @@ spacing_m = {SPACING}
 
 
 def check(done, prepared, real_end):
-    """The whole line was run inside its limits, no unit was above its own, nobody came near anybody, nothing was broken."""
+    """The whole line was run inside its limits, no unit was above its own, nobody came near anybody, nothing was violated."""
     rows, units, consists = done.trains, done.units, prepared.consists
     length = consists.train_length()[rows["train"].to_numpy().astype(int) - 1]
     front, speed = rows["position_m"].to_numpy(), rows["speed_mps"].to_numpy()

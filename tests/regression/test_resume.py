@@ -23,7 +23,7 @@ from trainctl.record.folder import remove
 from trainctl.runner import Backend, opened, resume, run
 from trainctl.runs.run import Run
 from trainctl.scenario.build import open_scenario
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 
 BIN = Path(sys.executable).parent / "trainctl"
 TABLES = ("trains.parquet", "units.parquet", "links.parquet")
@@ -148,7 +148,7 @@ def test_every_law_resumes_from_any_step(name, settings, tmp_path):
     ],
 )
 def test_runs_of_a_configuration_resume_from_any_step(net, law, backend, duration, tmp_path):
-    """Trains that have come, left, stopped, coupled, claimed switches and taken another way; the configuration itself is gone."""
+    """Trains that have come, left, stopped, coupled, requested switches and taken another way; the configuration itself is gone."""
     place = tmp_path / "configuration"
     place.mkdir()
     if net == "single_track":
@@ -163,7 +163,7 @@ def test_runs_of_a_configuration_resume_from_any_step(net, law, backend, duratio
     assert happened & {"couple", "stop_left", "switch_granted"}
 
 
-def assert_resumed(prepared: Prepared, place: Path, backend: Backend, shares: tuple[float, ...]) -> Run:
+def assert_resumed(prepared: Model, place: Path, backend: Backend, shares: tuple[float, ...]) -> Run:
     """A run that ends by an error, once or again, leaves what one that does not leaves; that one."""
     whole = run(prepared, place / "whole", backend, command_line=["x"])
     steps = whole.info["steps"]

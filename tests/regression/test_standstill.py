@@ -147,7 +147,7 @@ def test_what_acted_is_said_when_it_diverges(tmp_path: Path) -> None:
     with pytest.raises(LawError, match=words), opened(prepared, tmp_path / "run", "numeric") as s:
         for _ in range(90):
             s.step()
-        s.state.plant.estimate[prepared.heads[1], 2] = np.nan
+        s.state.plant.estimate[prepared.leading[1], 2] = np.nan
         s.step()
     reason = json.loads((tmp_path / "run.partial" / "run.json").read_text())["failure"]["reason"]
     assert "train 2 was held at standstill" in reason  # train 3 hears it

@@ -15,7 +15,7 @@ import psutil
 import pytest
 
 from trainctl.studies.results import write_results
-from trainctl.studies.sweep import Plan, jobs, ready_made, simulate
+from trainctl.studies.sweep import SweepPlan, jobs, ready_made, simulate
 
 BIN = Path(sys.executable).parent
 SEEDS, DURATION = range(8), 300
@@ -31,7 +31,7 @@ def alone(tmp_path_factory):
     """The dataset as this process computes it, one run after the other."""
     made = ready_made("monte_carlo")
     settings = {"topology.loss": [0.1], "run.duration_s": [DURATION]}
-    rows = [simulate(job) for job in jobs(Plan(made.scenario, settings, SEEDS, made.jitter))]
+    rows = [simulate(job) for job in jobs(SweepPlan(made.scenario, settings, SEEDS, made.jitter))]
     path = tmp_path_factory.mktemp("alone") / "results.parquet"
     write_results(rows, path)
     return path.read_bytes()

@@ -113,8 +113,8 @@ def test_ratchet_lets_nothing_get_worse(finished):
     new = run.links[(run.links.sender.astype(str) == "4") & (run.links.receiver.astype(str) == "5")].spacing_m.to_numpy()
     assert new[0] < 100.0
     assert new.min() >= new[0] - 1e-9
-    broken = {e["who"] for e in run.events if e["kind"] == "violation"}
-    assert broken == {"4-5"}
+    violated = {e["who"] for e in run.events if e["kind"] == "violation"}
+    assert violated == {"4-5"}
 
 
 def test_lost_messages_break_no_bound(finished):

@@ -17,7 +17,7 @@ from trainctl.scenario.build import open_scenario
 from trainctl.stages.driver import Driven, Driver
 from trainctl.stages.traffic import Traffic
 from trainctl.studies.results import write_results
-from trainctl.studies.sweep import Plan, jobs, simulate
+from trainctl.studies.sweep import SweepPlan, jobs, simulate
 from trainctl.sumo.session import collisions
 
 #: A law that never does anything.
@@ -149,7 +149,7 @@ def _blind(self, speed, acceleration, around, traffic, formed, commanded):
 
 def _let_in(self, t, ways, here, speed, s, due, reach=None):
     """Everybody comes at his time, whoever has the track."""
-    s, held = self._claim(t, ways, here, speed, np.zeros(len(speed), bool), s)
+    s, held = self._request(t, ways, here, speed, np.zeros(len(speed), bool), s)
     come = tuple((i, 35.0) for i in due)
     came = s.came.copy()
     for i, v in come:
@@ -174,7 +174,7 @@ def test_the_baseline_fails_too(tmp_path, typed):
 
 def test_in_a_sweep_a_collision_is_a_result(tmp_path):
     path = line(tmp_path / "s", RAMS)
-    found = [simulate(job) for job in jobs(Plan(str(path), {"run.duration_s": [20, 50]}, [], {}, "numeric"))]
+    found = [simulate(job) for job in jobs(SweepPlan(str(path), {"run.duration_s": [20, 50]}, [], {}, "numeric"))]
     assert [(row["status"], row["collisions"], row["gridlocks"]) for row in found] == [("complete", 0, 0), ("complete", 1, 0)]
     frame = write_results(found, tmp_path / "results.parquet")
     assert frame["collisions"].tolist() == pd.read_parquet(tmp_path / "results.parquet")["collisions"].tolist() == [0, 1]

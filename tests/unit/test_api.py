@@ -147,8 +147,8 @@ def test_what_can_be_read_agrees():
         links, x = sim.links, dict(zip(sim.trains, sim.position_m, strict=True))
         row = links[(links["sender"] == "1") & (links["receiver"] == "2")].iloc[0]
         assert row["spacing_m"] == x["1"] - x["2"]
-        heads = sim.units[sim.units["unit"] == 1]
-        np.testing.assert_allclose(heads["position_m"], sim.position_m, atol=1e-9)
+        leading = sim.units[sim.units["unit"] == 1]
+        np.testing.assert_allclose(leading["position_m"], sim.position_m, atol=1e-9)
         assert "8 s" in repr(sim)
     with pytest.raises(InputError, match="ended"):
         sim.step()

@@ -55,7 +55,7 @@ REPLACED: dict[str, tuple[str | None, str]] = {
     "trainctl run three_tracks --set controller.law=sumo --set controller.signals_m=4000 --out runs/fixed": (
         "trainctl run three_tracks --set controller.law=sumo --set controller.signals_m=4000 --out runs/fixed"
         " --set run.duration_s=60", "quicker"),
-    "trainctl compare capacity": (None, "three minutes; tests/unit/test_capacity.py runs it"),
+    "trainctl compare capacity": (None, "three minutes; tests/unit/studies/test_capacity.py runs it"),
     "trainctl run my_law/my_law.toml": ("trainctl run my_law/my_law.toml --set run.duration_s=24", "2400 s take too long"),
     "python -m pytest my_law": (None, "test_new.py runs these tests"),
     "sumo-gui -n nets/three_tracks.net.xml": ("sumo -n nets/three_tracks.net.xml -e 1", "no screen"),
@@ -126,7 +126,7 @@ def checked(text: str, folder: Path) -> None:
     elif "scenario" in tomllib.loads(text):
         plan = sweep.ready_made(str(folder / name))
         assert plan is not None
-        sweep.prepared(sweep.jobs(plan)[0])
+        sweep.job_model(sweep.jobs(plan)[0])
     else:
         open_scenario(str(folder / name))
 

@@ -79,7 +79,7 @@ class History(NamedTuple):
         return -np.diff(self.own[:, :, 0].reshape(-1, 3, 4), axis=2).reshape(-1, 9) - 80.0
 
     def couplers(self) -> tuple[float, float]:
-        """Least and largest coupler displacement [m] over all sub-steps."""
+        """Minimum and largest coupler displacement [m] over all sub-steps."""
         inner = np.isfinite(self.extremes.coupler_min)
         return float(self.extremes.coupler_min[inner].min()), float(self.extremes.coupler_max[inner].max())
 
@@ -155,7 +155,7 @@ class Started(NamedTuple):
     """What came of another start, the leader at 316 km/h throughout."""
 
     couplers: tuple[float, float]  # m, minimum and maximum over all sub-steps
-    interval: float  # m, least
+    interval: float  # m, minimum
     error: float  # m/s, largest at the end
     interval_error: float  # m, largest at the end
     rise: float  # largest rise of V in a second, in shares of V(0)
@@ -271,11 +271,11 @@ def speeds(runs: Runs) -> Iterator[Claim]:
         f"as a 2 % band only (0.1 m/s: {narrow} s). x_r(0) is not printed: 108.8 km, x_1,1(0), and 109 km, from (17), which is used below",
         corrected=True,
     )  # fmt: skip
-    over, least = h.overshoot(), min(runs.overshoots)
+    over, minimum = h.overshoot(), min(runs.overshoots)
     yield claim(
-        "speeds do not overshoot (Fig. 3): largest excess over 316 km/h", 0, over, "m/s", least < 0.1,
+        "speeds do not overshoot (Fig. 3): largest excess over 316 km/h", 0, over, "m/s", minimum < 0.1,
         f"it cannot be: a train behind its slot has to be faster to catch up. Tried: {len(LEADERS)} values of x_r(0) from {LEADERS[0] / 1e3:g} to "
-        f"{LEADERS[-1] / 1e3:g} km, at least {least:.3g} m/s with each",
+        f"{LEADERS[-1] / 1e3:g} km, at least {minimum:.3g} m/s with each",
     )  # fmt: skip
     yield claim(
         "speeds change more smoothly than with ordinary consensus, and overshoot less (Fig. 7): overshoot, peak force of a unit, peak jerk; other "
@@ -350,9 +350,9 @@ def theorem(runs: Runs) -> Iterator[Claim]:
 def intervals(runs: Runs) -> Iterator[Claim]:
     """Fig. 6."""
     h = runs.example
-    least = float(np.nanmin(h.extremes.watched_min[1:]))
+    minimum = float(np.nanmin(h.extremes.watched_min[1:]))
     yield claim(
-        "tracking intervals stay above the emergency distance 1500 m (Fig. 6): minimum", "> 1500", least, "m", least > 1500.0
+        "tracking intervals stay above the emergency distance 1500 m (Fig. 6): minimum", "> 1500", minimum, "m", minimum > 1500.0
     )
     final = h.intervals()[-1]
     yield claim("tracking intervals converge to 3000 m (Fig. 6): at 4000 s", 3000.0, float(final[np.argmax(np.abs(final - 3000.0))]), "m",

@@ -324,8 +324,8 @@ def numbers(runs: Runs) -> Iterator[Claim]:
         "varrho_2, varrho_1 of Remark 2.1", "26.5, 30.55", f"{-low:.2f}, {high:.2f}", "m/s", {round(-low, 1), round(high, 1)} == {30.5, 26.5},
         "printed swapped and rounded: it would only guarantee 54 m/s instead of 50", corrected=True,
     )  # fmt: skip
-    broken = law.violations(law.Params(), paper_scene())
-    yield claim("Table 2 satisfies the start condition (39), the gains (38): rules violated", 0, len(broken), "1", not broken)
+    violated = law.violations(law.Params(), paper_scene())
+    yield claim("Table 2 satisfies the start condition (39), the gains (38): rules violated", 0, len(violated), "1", not violated)
     gains = asymptotic.constants(asymptotic.Params(), paper_scene())
     k4, C = gains.k4[0], gains.C[0]
     matrix = np.zeros((5, 5))

@@ -248,7 +248,7 @@ def assumptions(runs: Runs) -> Iterator[Claim]:
         "Assumptions 2.1 to 2.4 and (13) hold at the start: rules violated", 0, len(mended), "1", not mended, note, bool(printed)
     )
     yield claim("(13) holds when train 5 joins at 1000 s: rules violated", 0, len(later), "1", not later)
-    low, high = 1.0, 11.0  # broken, not broken
+    low, high = 1.0, 11.0  # violated, not violated
     while high - low > 1e-4:
         middle = (low + high) / 2
         low, high = (middle, high) if law.violations(law.Params(), scene(BEFORE, inputs=middle)) else (low, middle)

@@ -94,7 +94,7 @@ def printed(k: int, position: Floats) -> Disturbed:
     return disturbance.at(SIGNALS, k, k * T, position)
 
 
-SIGNALS = disturbance.prepare(entries(PRINTED), ["1", "2", "3", "4"], T, None)
+SIGNALS = disturbance.signals(entries(PRINTED), ["1", "2", "3", "4"], T, None)
 
 
 class Loop:
@@ -187,8 +187,8 @@ class Scaled(NamedTuple):
         diagonal = np.arange(N)
         left = -c * T * (self.rho1 * self.rho2)[:, :, None] * self.laplacian
         left[:, diagonal, diagonal] += 1 - T / c - own
-        least = np.minimum(left.min(axis=(1, 2)), np.minimum((T / c + own).min(axis=1), min(1 - T / c, T / c)))
-        return int((least < -1e-12).sum()), float(least.min())
+        minimum = np.minimum(left.min(axis=(1, 2)), np.minimum((T / c + own).min(axis=1), min(1 - T / c, T / c)))
+        return int((minimum < -1e-12).sum()), float(minimum.min())
 
     def spreads(self, c: float) -> Floats:
         """Spread max - min of psi for c [s], shape (400,)."""
@@ -338,10 +338,10 @@ def transients(runs: Runs) -> Iterator[Claim]:
         "all speeds go from 0 to 80 m/s (Fig. 3): largest error at 1000 s", 0, final, "m/s", final < 1e-3,
         f"without disturbance; within 1 % from {settled:.5g} s, after a while at the bound of 85 m/s",
     )  # fmt: skip
-    least, most = (float(f(h.distance)) for f, h in ((np.min, calm), (np.max, calm)))
+    minimum, most = (float(f(h.distance)) for f, h in ((np.min, calm), (np.max, calm)))
     low, high = float(kicked.distance.min()), float(kicked.distance.max())
     yield claim(
-        "positions and distances on the way (Figs. 2, 4): no train passes another, minimum and maximum", "> 0", span(least, most), "m", least > 0.0,
+        "positions and distances on the way (Figs. 2, 4): no train passes another, minimum and maximum", "> 0", span(minimum, most), "m", minimum > 0.0,
         f"distances from 8500, 11000, 7500 m; {span(low, high)} m under the printed disturbances; the figure's values are not in the text",
     )  # fmt: skip
 
@@ -360,12 +360,12 @@ def proof(runs: Runs) -> Iterator[Claim]:
         "no eta2 satisfies Assumption 2 here, see above; tried, too: eta2 = 1, the most charitable, which this rho2 is far from",
     )  # fmt: skip
     line = scaled["line"]
-    negative, least = line.negative(2 / 0.3)
+    negative, minimum = line.negative(2 / 0.3)
     fewest = min(s.negative(c)[0] for s in scaled.values() for c in np.geomspace(1.0, 500.0, 60))
     falls = all(np.all(np.diff(s.spreads(2 / 0.3)) <= 1e-9) for s in scaled.values())
     yield claim(
         "(16) is a product of stochastic matrices: steps of the example with a negative element", 0, negative, "1", fewest == 0,
-        f"minimum element {least:.3f} with c = 2/h; tried: 60 values of c from 1 to 500 s on three graphs ({', '.join(scaled)}), at least {fewest} such steps with each. "
+        f"minimum element {minimum:.3f} with c = 2/h; tried: 60 values of c from 1 to 500 s on three graphs ({', '.join(scaled)}), at least {fewest} such steps with each. "
         f"The spread still {'falls in every step' if falls else 'does not fall in every step'} (c = 2/h)",
     )  # fmt: skip
 

@@ -15,7 +15,7 @@ from trainctl.errors import InputError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from trainctl.scenario.model import Prepared
+    from trainctl.scenario.model import Model
 
 DEFAULT_SCENARIO = "three_tracks"
 
@@ -42,7 +42,7 @@ Settings = Annotated[
 ]
 
 
-def named(name: str, settings: list[str] | None) -> Prepared:
+def named(name: str, settings: list[str] | None) -> Model:
     """The scenario of that name, with these settings."""
     from trainctl.scenario.build import open_scenario
 

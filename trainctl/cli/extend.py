@@ -58,7 +58,7 @@ def export(
 def replay(
     folder: RunFolder,
     from_s: Annotated[float, typer.Option(help="Begin at this time of the run [s].")] = 0.0,
-    delay_ms: Annotated[float, typer.Option(help="Least time of a step on the screen [ms].")] = 20.0,
+    delay_ms: Annotated[float, typer.Option(help="Minimum time of a step on the screen [ms].")] = 20.0,
     gui_program: Annotated[str, typer.Option(help="The program to start; sumo is the same without a window.")] = "sumo-gui",
 ) -> None:
     """Show a run again in sumo-gui, as it was recorded."""

@@ -29,7 +29,7 @@ from trainctl.errors import InputError, TrainctlError
 
 if TYPE_CHECKING:
     from trainctl.runs.run import Run
-    from trainctl.scenario.model import Prepared
+    from trainctl.scenario.model import Model
 
 
 @app.command()
@@ -48,7 +48,7 @@ def run(
     ] = None,
     settings: Settings = None,
     force: Annotated[bool, typer.Option("--force", help="Replace whatever lies at the run folder.")] = False,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if any bound was broken.")] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if any bound was violated.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no summary.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -62,39 +62,39 @@ def run(
         raise InputError("--gui: shows SUMO; leave out --backend numeric")
     if record_every is not None:
         settings = [*(settings or []), f"run.record_every_s={record_every!r}"]
-    prepared = named(name, settings)
+    model = named(name, settings)
     folder = out if out is not None else Path("runs") / Path(name).stem
     shown = not (quiet or as_json)
     with Progress(f"{Path(name).stem}", shown and sys.stderr.isatty()) as advance:
-        done = runner.run(prepared, folder, backend, force, sys.argv, advance, gui_program if gui else None, checkpoint_every)
+        done = runner.run(model, folder, backend, force, sys.argv, advance, gui_program if gui else None, checkpoint_every)
     if as_json:
         show_json({"folder": str(folder), **done.info, "metrics": done.metrics})
     elif shown:
-        _summary(done, prepared)
+        _summary(done, model)
     if not done.ok or (strict and done.info["violations"]):
         raise typer.Exit(1)
 
 
-def _summary(done: Run, prepared: Prepared) -> None:
+def _summary(done: Run, model: Model) -> None:
     """Where the results lie, and whether the bounds held."""
     from trainctl.runs.outcome import summary
 
     info, metrics = done.info, done.metrics
-    print(prepared.scenario.title)
+    print(model.scenario.title)
     table = listing(None, "", "")
     table.show_header = False
-    law = prepared.scenario.controller.law
+    law = model.scenario.controller.law
     table.add_row(
-        "law, plant", f"{law} on {prepared.scenario.plant.kind}, {len(prepared.scenario.train)} trains, backend {info['backend']}"
+        "law, plant", f"{law} on {model.scenario.plant.kind}, {len(model.scenario.train)} trains, backend {info['backend']}"
     )
-    table.add_row("steps", f"{info['steps']} of {prepared.scenario.run.step_s:g} s in {info['wall_time_s']:.1f} s")
+    table.add_row("steps", f"{info['steps']} of {model.scenario.run.step_s:g} s in {info['wall_time_s']:.1f} s")
     for key, words, unit in (
-        ("bounds.spacing_lower_margin_m", "least spacing above its lower bound", "m"),
-        ("bounds.spacing_upper_margin_m", "least room below the upper spacing bound", "m"),
-        ("bounds.speed_lower_margin_mps", "least speed above its lower bound", "m/s"),
-        ("bounds.speed_upper_margin_mps", "least room below the upper speed bound", "m/s"),
-        ("bounds.input_lower_margin_mps2", "least input above its lower bound", "m/s2"),
-        ("bounds.input_upper_margin_mps2", "least room below the upper input bound", "m/s2"),
+        ("bounds.spacing_lower_margin_m", "minimum spacing above its lower bound", "m"),
+        ("bounds.spacing_upper_margin_m", "minimum room below the upper spacing bound", "m"),
+        ("bounds.speed_lower_margin_mps", "minimum speed above its lower bound", "m/s"),
+        ("bounds.speed_upper_margin_mps", "minimum room below the upper speed bound", "m/s"),
+        ("bounds.input_lower_margin_mps2", "minimum input above its lower bound", "m/s2"),
+        ("bounds.input_upper_margin_mps2", "minimum room below the upper input bound", "m/s2"),
         ("formation.settling_s", "all links within 1 m from", "s"),
         ("formation.final_error_m", "largest spacing error at the end", "m"),
     ):
@@ -104,7 +104,7 @@ def _summary(done: Run, prepared: Prepared) -> None:
         table.add_row(line.title, f"FAILED: {line.text}" if line.failed else line.text)
     table.add_row("results", f"{done.folder}/  (trainctl plot {done.folder}; trainctl metrics {done.folder})")
     show(table)
-    for note in prepared.roster.notes:
+    for note in model.roster.notes:
         print(f"warning: {note}")
 
 
@@ -129,14 +129,14 @@ def list_(as_json: Json = False) -> None:
 @app.command()
 def check(name: ScenarioName = DEFAULT_SCENARIO, settings: Settings = None, as_json: Json = False) -> None:
     """Check a scenario without running it: every mistake, every assumption of its law, and what follows from them."""
-    prepared = named(name, settings)
+    model = named(name, settings)
     from trainctl.scenario.check import facts
 
-    found = facts(prepared)
+    found = facts(model)
     if as_json:
         show_json(found)
         return
-    print(f"{prepared.file}: no mistakes, no start condition of {prepared.scenario.controller.law} broken")
+    print(f"{model.file}: no mistakes, no start condition of {model.scenario.controller.law} violated")
     table = listing(None, "", "")
     table.show_header = False
     for key, value in found.items():

@@ -128,7 +128,7 @@ def _capacity(given: dict[str, Any], out: Path, formats: tuple[str, ...], worker
     from trainctl.cli.console import Progress, listing, show, show_json
     from trainctl.studies import capacity
 
-    plan = capacity.Plan(**given)
+    plan = capacity.CapacityPlan(**given)
     with Progress("capacity", sys.stderr.isatty()) as advance:
         table = capacity.compare(plan, out, workers=workers, progress=advance)
     pictures = capacity.figure(table, plan, out / "capacity", formats)
@@ -159,7 +159,7 @@ def _under_all(
     from trainctl.cli.console import Progress, setting
     from trainctl.errors import TrainctlError
     from trainctl.laws import laws
-    from trainctl.scenario.build import prepare
+    from trainctl.scenario.build import model_of
     from trainctl.scenario.reading import examine, read
     from trainctl.studies import compare as comparing
 
@@ -170,9 +170,9 @@ def _under_all(
             scenario, found = examine(changed)
             if scenario is None:
                 raise InputError(found)
-            prepared = prepare(scenario, path.name, path.parent, found)
+            model = model_of(scenario, path.name, path.parent, found)
             with Progress(law, sys.stderr.isatty()) as advance:
-                runs.append(runner.run(prepared, out / law, backend, False, sys.argv, advance))
+                runs.append(runner.run(model, out / law, backend, False, sys.argv, advance))
             labels.append(law)
         except InputError as error:
             left_out[law] = list(error.mistakes)

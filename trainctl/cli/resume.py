@@ -16,7 +16,7 @@ def register(app: typer.Typer) -> None:
 
 def resume(
     folder: Annotated[Path, typer.Argument(help="Run folder DIR, or DIR.partial.")],
-    strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if any bound was broken.")] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if any bound was violated.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no summary.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")] = False,
 ) -> None:

@@ -11,7 +11,7 @@ import typer
 from trainctl.errors import InputError
 
 if TYPE_CHECKING:
-    from trainctl.studies.sweep import Plan
+    from trainctl.studies.sweep import SweepPlan
 
 
 def register(app: typer.Typer) -> None:
@@ -48,7 +48,7 @@ def register(app: typer.Typer) -> None:
     ) -> None:
         """Run a scenario with many settings and seeds, on all cores or a cluster, into one Parquet dataset.
 
-        OUT gets results.parquet (one row per run: parameters, status, what was broken, metrics), summary.png and sweep.json. Exit 3
+        OUT gets results.parquet (one row per run: parameters, status, violations, metrics), summary.png and sweep.json. Exit 3
         if runs failed; the others are there all the same. A collision is a result of its run, not a failed run.
         """
         from trainctl.cli.console import show_json
@@ -73,16 +73,16 @@ def register(app: typer.Typer) -> None:
             raise typer.Exit(1)
 
 
-def _plan(name: str, settings: list[str] | None, seeds: str | None, jitter: list[str] | None, backend: str) -> Plan:
+def _plan(name: str, settings: list[str] | None, seeds: str | None, jitter: list[str] | None, backend: str) -> SweepPlan:
     """What the command line asks for, laid over a ready-made sweep."""
     from trainctl.studies import sweep as sweeping
 
-    made = sweeping.ready_made(name) or sweeping.Plan(name, {}, [], {})
+    made = sweeping.ready_made(name) or sweeping.SweepPlan(name, {}, [], {})
     axes = {**made.settings, **dict(map(sweeping.values, settings or []))}
     if seeds is not None:
         axes.pop("run.seed", None)
     wanted = sweeping.seeds(seeds) if seeds is not None else made.seeds
-    return sweeping.Plan(made.scenario, axes, wanted, {**made.jitter, **dict(map(sweeping.half_width, jitter or []))}, backend)
+    return sweeping.SweepPlan(made.scenario, axes, wanted, {**made.jitter, **dict(map(sweeping.half_width, jitter or []))}, backend)
 
 
 class _Progress:
@@ -120,7 +120,7 @@ class _Progress:
 
 
 def _summary(folder: Path, info: dict[str, Any]) -> None:
-    """How many runs there are, and in which share of them a bound was broken."""
+    """How many runs there are, and in which share of them a bound was violated."""
     from trainctl.cli.console import listing, show
     from trainctl.studies.results import shares
 
@@ -128,7 +128,7 @@ def _summary(folder: Path, info: dict[str, Any]) -> None:
     print(f"{info['runs']} runs: " + ", ".join(f"{count} {word}" for word, count in told.items()))
     varied = [key for key, values in info["set"].items() if len(values) > 1]
     rows = shares(folder, varied)
-    table = listing(None, *varied, "runs", "with a broken bound", "share", "95 % interval")
+    table = listing(None, *varied, "runs", "with a violated bound", "share", "95 % interval")
     for row in rows[:40]:
         low, high = row["interval_95"]
         table.add_row(

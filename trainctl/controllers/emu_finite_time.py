@@ -288,10 +288,10 @@ def watched_bounds(params: Params, scene: Scene) -> tuple[Floats, Floats]:
 def violations(params: Params, scene: Scene) -> list[str]:
     """Say which hypotheses of Theorem 1, and which needs of the law, do not hold at the start."""
     found = emu_theory.violations(params, scene)
-    return found or [*broken_step(params, scene)]  # the step is rehearsed from the start, which must be a sound one
+    return found or [*step_violations(params, scene)]  # the step is rehearsed from the start, which must be a sound one
 
 
-def broken_step(params: Params, scene: Scene) -> list[str]:
+def step_violations(params: Params, scene: Scene) -> list[str]:
     """Find a step that the in-train terms do not bear."""
     if np.isnan(scene.links.slot).any() or not np.isfinite(scene.own).all():
         return []
@@ -419,14 +419,14 @@ def numbered(controller: Mapping[str, Any], observer: str) -> dict[str, str]:
 
 def alternative(tables: stated.Tables) -> dict[str, Any]:
     """Tables that put this law in front of the traffic of another."""
-    (least, wanted, most), alpha = stated.clear_distances(tables), tables["controller"]["alpha_1"]
-    zone = min(600.0, 0.4 * max(wanted - least, 1.0))
-    own = {"law": "emu_finite_time", "emergency_distance_m": least, "emergency_zone_m": zone, "range_m": most, "alpha_1": alpha}
+    (minimum, wanted, most), alpha = stated.clear_distances(tables), tables["controller"]["alpha_1"]
+    zone = min(600.0, 0.4 * max(wanted - minimum, 1.0))
+    own = {"law": "emu_finite_time", "emergency_distance_m": minimum, "emergency_zone_m": zone, "range_m": most, "alpha_1": alpha}
     return {"controller": own, "run": {**tables["run"], "sub_step_s": 0.0025 if alpha == 1.0 else 0.01}}
 
 
 def on_a_line(tables: stated.Tables, band: dict[str, float]) -> dict[str, Any]:
     """Tables of its rows in `trainctl compare capacity`."""
-    (least, wanted, _), spacing = stated.clear_distances(tables), tables["topology"]["spacing_m"]
-    own = {"emergency_distance_m": least, "emergency_zone_m": 0.4 * (wanted - least), "range_m": max(10_000.0, 2.0 * spacing)}
+    (minimum, wanted, _), spacing = stated.clear_distances(tables), tables["topology"]["spacing_m"]
+    own = {"emergency_distance_m": minimum, "emergency_zone_m": 0.4 * (wanted - minimum), "range_m": max(10_000.0, 2.0 * spacing)}
     return {"controller": {**tables["controller"], **own}, "run": {**tables["run"], "sub_step_s": 0.02}}

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def violations(params: Params, scene: Scene) -> list[str]:
     """Every rule that fails: of the zones, of every train, of every pair of trains."""
-    return [*broken_zones(params), *broken_trains(params, scene), *broken_links(params, scene)]
+    return [*zone_violations(params), *train_violations(params, scene), *link_violations(params, scene)]
 
 
 def pair_inertia(inertia: Floats) -> Floats:
@@ -26,7 +26,7 @@ def pair_inertia(inertia: Floats) -> Floats:
     return np.where(after == inertia, inertia, 2.0 * inertia * after / (inertia + after))
 
 
-def broken_zones(params: Params) -> list[str]:
+def zone_violations(params: Params) -> list[str]:
     """Find zones that do not fit: delta1 in (0, h1), delta2 in (0, h2)."""
     p, found = params, []
     if p.stretch_zone_m >= p.coupler_stretch_m:
@@ -39,7 +39,7 @@ def broken_zones(params: Params) -> list[str]:
     return found
 
 
-def broken_trains(params: Params, scene: Scene) -> list[str]:
+def train_violations(params: Params, scene: Scene) -> list[str]:
     """Find trains of unequal units, with couplers stiffer than p1 or out of range, or without a slot."""
     found = []
     c, (h1, h2) = scene.consists, (params.coupler_stretch_m, params.coupler_compression_m)
@@ -66,7 +66,7 @@ def broken_trains(params: Params, scene: Scene) -> list[str]:
     return found
 
 
-def broken_links(params: Params, scene: Scene) -> list[str]:
+def link_violations(params: Params, scene: Scene) -> list[str]:
     """Find pairs too near, out of their zones, against their slots, or heard one way only."""
     found = []
     links, first, length = scene.links, scene.consists.first, scene.consists.train_length()

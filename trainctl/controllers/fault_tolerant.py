@@ -107,8 +107,8 @@ class Params(Table):
     head_l2: Gains = Field(2.1, description="ell2, eq. (36); above 2")
     head_l3: Gains = Field(4.3, description="ell3, eq. (36); above 2 + ell2^2 / 2")
     head_l4: Gains = Field(1.0, description="ell4, eq. (37); above 1/2")
-    speed_error_lower_mps: float = Field(-50.0, lt=0, description="-sigma2: least speed difference to the train ahead [m/s], R3")
-    speed_error_upper_mps: float = Field(50.0, gt=0, description="sigma1: greatest speed difference to the train ahead [m/s], R3")
+    speed_error_lower_mps: float = Field(-50.0, lt=0, description="-sigma2: minimum speed difference to the train ahead [m/s], R3")
+    speed_error_upper_mps: float = Field(50.0, gt=0, description="sigma1: maximum speed difference to the train ahead [m/s], R3")
     leader_error_lower_m: float = Field(-2351.0, lt=0, description="-rho2 of the train that follows the reference [m], R2")
     leader_error_upper_m: float = Field(1947.0, gt=0, description="rho1 of the train that follows the reference [m], R2")
 
@@ -303,7 +303,7 @@ def inadmissible(params: Params, spacing_error: float, speed_error: float, lower
     speed_error : float
         vt: speed of the tail of the train ahead minus own [m/s].
     lower, upper : float
-        -rho2 and rho1: least and greatest spacing minus the desired one [m].
+        -rho2 and rho1: minimum and maximum spacing minus the desired one [m].
     train : int
         Its place among the trains, for gains of its own.
     """
@@ -350,11 +350,11 @@ def _gains(params: Params) -> Iterator[str]:
     """Conditions (38)."""
     pairs = np.broadcast_arrays(np.atleast_1d(params.head_l2), np.atleast_1d(params.head_l3))
     for l2, l3 in dict.fromkeys(zip(*(row.tolist() for row in pairs), strict=True)):
-        least = 2.0 + 0.5 * l2**2
+        minimum = 2.0 + 0.5 * l2**2
         if l2 <= 2.0:
             yield f"controller.head_l2 = {l2:g}: must be above 2, condition (38)"
-        if l3 <= least:
-            yield f"controller.head_l3 = {l3:g}: must be above 2 + head_l2^2 / 2 = {least:g}, condition (38)"
+        if l3 <= minimum:
+            yield f"controller.head_l3 = {l3:g}: must be above 2 + head_l2^2 / 2 = {minimum:g}, condition (38)"
     if (l4 := float(np.min(params.head_l4))) <= 0.5:
         yield f"controller.head_l4 = {l4:g}: must be above 1/2, condition (38)"
 

@@ -15,7 +15,7 @@ theta                     lead of the plant: ``x(k+1) = x + ((1 - theta) v(k) + 
 z                         ``x + (1 - theta) v T - x_r`` [m], what a train sends; ``z_ji = z_j - z_i``
 d, gamma, Gamma           desired spacing, its lower and upper bound [m], here of ``z_ji``: x_j - x_i
 rho, Rho, mu, Mu          lower and upper bounds of speed [m/s] and input [m/s2]
-f, F                      least and greatest running resistance on [rho, Rho] [m/s2]
+f, F                      minimum and maximum running resistance on [rho, Rho] [m/s2]
 alpha, beta, eta          how far back the links, the speed and the input let a train move in the moving frame [m], eq. (10)
 Alpha, Beta, Eta          how far forward
 G, s                      wanted and admitted move [m], eqs. (10), (12)
@@ -182,12 +182,12 @@ def _admitted(
         v, v_r = speed[i], reference[i]
         beta, Beta = (c.rho[i] - v_r) * T, (c.Rho[i] - v_r) * T
         if c.own_speed:
-            least = greatest = believed[i]
+            minimum = maximum = believed[i]
             if c.held:  # the input is acceleration plus resistance, and the latter changes while the former is held
                 now = resistance_of(i, v, c.davis)
-                least, greatest = believed[i] + (c.f[i] - now), believed[i] + (c.F[i] - now)
+                minimum, maximum = believed[i] + (c.f[i] - now), believed[i] + (c.F[i] - now)
             vbar = v - v_r
-            eta, Eta = vbar * T + (c.mu[i] - least) * (T * T), vbar * T + (c.Mu[i] - greatest) * (T * T)
+            eta, Eta = vbar * T + (c.mu[i] - minimum) * (T * T), vbar * T + (c.Mu[i] - maximum) * (T * T)
         else:
             eta = c.Rho[i] * T + (c.mu[i] - c.f[i]) * (T * T) - v_r * T
             Eta = c.rho[i] * T + (c.Mu[i] - c.F[i]) * (T * T) - v_r * T
@@ -200,7 +200,7 @@ def _admitted(
 
 
 def _resistance_range(davis: Floats, rho: Floats, Rho: Floats) -> tuple[Floats, Floats]:
-    """Least and greatest resistance on [rho, Rho], (n,) each. No coefficient is negative, so it grows with the speed."""
+    """Minimum and maximum resistance on [rho, Rho], (n,) each. No coefficient is negative, so it grows with the speed."""
     return resistance(rho, davis), resistance(Rho, davis)
 
 
@@ -265,7 +265,7 @@ def _input_violations(scene: Scene, slow: float, fast: float) -> Iterator[str]:
     def to_brake(i: int) -> str:
         key = f"input_lower_mps2 = {mu[i]:.10g}"
         if not brakes[i]:
-            return f"{key}: must be below the least running resistance, {f[i]:.6g} m/s2 at {rho[i]:.10g} m/s (Assumption 2.4)"
+            return f"{key}: must be below the minimum running resistance, {f[i]:.6g} m/s2 at {rho[i]:.10g} m/s (Assumption 2.4)"
         need = f[i] - (Rho[i] - slow) / T
         span = f"from {Rho[i]:.10g} to {slow:.10g} m/s within one control period of {T:.10g} s"
         return f"{key}: must be below {need:.6g} to brake {span}{cure} (Assumption 2.4)"
@@ -273,7 +273,7 @@ def _input_violations(scene: Scene, slow: float, fast: float) -> Iterator[str]:
     def to_pull(i: int) -> str:
         key = f"input_upper_mps2 = {Mu[i]:.10g}"
         if not pulls[i]:
-            return f"{key}: must be above the greatest running resistance, {F[i]:.6g} m/s2 at {Rho[i]:.10g} m/s (Assumption 2.4)"
+            return f"{key}: must be above the maximum running resistance, {F[i]:.6g} m/s2 at {Rho[i]:.10g} m/s (Assumption 2.4)"
         need = F[i] + (fast - rho[i]) / T
         span = f"from {rho[i]:.10g} to {fast:.10g} m/s within one control period of {T:.10g} s"
         return f"{key}: must be above {need:.6g} to speed up {span}{cure} (Assumption 2.4)"
@@ -284,7 +284,7 @@ def _input_violations(scene: Scene, slow: float, fast: float) -> Iterator[str]:
 
 
 def _speed_range(reference: Reference, time: float) -> tuple[float, float]:
-    """Least and greatest speed of the virtual leader from ``time`` on, looked up at both ends of its pieces [m/s]."""
+    """Minimum and maximum speed of the virtual leader from ``time`` on, looked up at both ends of its pieces [m/s]."""
     out, speeds = np.empty(4), []
     leader_at(reference, time, time, out)
     speeds.append(out[SPEED])

@@ -12,7 +12,7 @@ a_ij     weight with which train i hears train j [1/s2]
 d_ij     wanted p_i - p_j [m]; a link carries the wanted p_sender - p_receiver, which is -d_ij
 T        control period [s]
 u_c      demanded acceleration [m/s2]; the input is u_c plus the running resistance u_r, which the plant adds
-theta_1  greatest speed [m/s]; theta_2 least and greatest input [m/s2]
+theta_1  maximum speed [m/s]; theta_2 minimum and maximum input [m/s2]
 kappa    how often the running resistance goes into the input, at least
 
 Notes
@@ -23,7 +23,7 @@ Departs from the paper:
   Where all messages are fresh this is eq. (6).
 * A lost message (the paper knows none): the last one is kept. In this frame that takes the silent neighbour to run on at v0, so
   the loop becomes one with a delay. Leaving the term out instead makes the loop weaker: in the paper's example with 70 % of the
-  messages lost the greatest error of the ends is 15 m with the first rule (12.5 m without losses) and 45 m with the second. A
+  messages lost the maximum error of the ends is 15 m with the first rule (12.5 m without losses) and 45 m with the second. A
   neighbour that falls silent for good is safe with neither: see ``links.parquet`` for what was heard. A train that has never
   heard one of its neighbours does not accelerate.
 * There is no spacing constraint: see ``warnings``.
@@ -212,23 +212,23 @@ def _clamp_violations(scene: Scene) -> list[str]:
     found = []
     for field, row in bounds._asdict().items():
         key = f"bounds.{field}_{'mps2' if field.startswith('input') else 'mps'}"
-        found += _broken(scene, f"{key} =", row, ~np.isfinite(row), "must be given, the model (4) clamps every speed and input")
+        found += _violated(scene, f"{key} =", row, ~np.isfinite(row), "must be given, the model (4) clamps every speed and input")
         if field.endswith("upper"):
-            found += _broken(scene, f"{key} =", row, row <= 0.0, "must be above 0")
+            found += _violated(scene, f"{key} =", row, row <= 0.0, "must be above 0")
     low, high = bounds.speed_lower, bounds.speed_upper
-    found += _broken(scene, f"reference.speed_mps = {fastest:g}: must be below the maximum speed", high, fastest >= high, "m/s")
-    found += _broken(scene, f"reference.speed_mps = {slowest:g}: must be above the least speed", low, slowest <= low, "m/s")
-    found += _broken(scene, "bounds.speed_lower_mps =", low, np.isfinite(low) & (low < 0.0), "must not be negative")
-    found += _broken(scene, "bounds.input_lower_mps2 =", bounds.input_lower, bounds.input_lower >= 0.0, "must be below 0")
-    found += _broken(scene, "train.speed_mps =", speed, (speed < low) | (speed > high), "outside the admissible speeds")
+    found += _violated(scene, f"reference.speed_mps = {fastest:g}: must be below the maximum speed", high, fastest >= high, "m/s")
+    found += _violated(scene, f"reference.speed_mps = {slowest:g}: must be above the minimum speed", low, slowest <= low, "m/s")
+    found += _violated(scene, "bounds.speed_lower_mps =", low, np.isfinite(low) & (low < 0.0), "must not be negative")
+    found += _violated(scene, "bounds.input_lower_mps2 =", bounds.input_lower, bounds.input_lower >= 0.0, "must be below 0")
+    found += _violated(scene, "train.speed_mps =", speed, (speed < low) | (speed > high), "outside the admissible speeds")
     return found
 
 
-def _broken(scene: Scene, key: str, value: Floats, broken: Bools, rule: str) -> list[str]:
+def _violated(scene: Scene, key: str, value: Floats, violated: Bools, rule: str) -> list[str]:
     """One line per different value for all trains it concerns."""
     lines = []
-    for v in np.unique(value[broken]):
-        who = [scene.trains[i] for i in np.flatnonzero(broken & (value == v)).tolist()]
+    for v in np.unique(value[violated]):
+        who = [scene.trains[i] for i in np.flatnonzero(violated & (value == v)).tolist()]
         names = "all trains" if len(who) == len(scene.trains) else f"train {_some(who, ', ')}"
         between = ": " if key.endswith("=") else " "
         lines.append(f"{key} {v:g}{between}{rule} ({names})")
@@ -244,7 +244,7 @@ def _assumption_1(scene: Scene) -> list[str]:
             ratio = value / r
         short = np.isfinite(ratio) & (value > 0.0) & (ratio <= KAPPA)
         rule = f"times the running resistance is all the input allows, Assumption 1 needs more than {KAPPA:g}"
-        found += _broken(scene, f"bounds.{field}_mps2:", np.round(ratio, 2), short, rule)
+        found += _violated(scene, f"bounds.{field}_mps2:", np.round(ratio, 2), short, rule)
     return found
 
 
@@ -285,8 +285,8 @@ def warnings(params: Params, scene: Scene, tracks: Sequence[int] | None = None) 
 class Disturbing(Protocol):
     """What the analysis asks of an entry of the scenario's disturbances; see ``plants.disturbance``."""
 
-    def greatest(self, trains: Sequence[str]) -> Floats:
-        """Greatest magnitude on each channel of each train, shape (5, n)."""
+    def maximum(self, trains: Sequence[str]) -> Floats:
+        """Maximum magnitude on each channel of each train, shape (5, n)."""
 
     def steady(self, trains: Sequence[str]) -> Floats | None:
         """Value on each channel of each train, shape (5, n), if it never changes."""
@@ -299,7 +299,7 @@ def analysis(params: Params, scene: Scene, disturbances: Sequence[Disturbing]) -
     amplitude, constant = np.zeros((5, n)), np.zeros((5, n))
     changing = False
     for entry in disturbances:
-        amplitude = amplitude + entry.greatest(scene.trains)
+        amplitude = amplitude + entry.maximum(scene.trains)
         value = entry.steady(scene.trains)
         changing |= value is None
         constant = constant + (0.0 if value is None else value)

@@ -57,7 +57,7 @@ def train_resistance(scene: Scene, speed: Floats) -> Floats:
 
 
 def greatest_resistance(scene: Scene) -> Floats:
-    """Resistance at the greatest admissible speed [m/s2], shape (n,); inf without one."""
+    """Resistance at the maximum admissible speed [m/s2], shape (n,); inf without one."""
     upper = scene.bounds.speed_upper
     return np.where(np.isfinite(upper), train_resistance(scene, np.where(np.isfinite(upper), upper, 0.0)), np.inf)
 
@@ -176,7 +176,7 @@ def _responses(loop: Loop, steps: int) -> tuple[Floats, Floats]:
 
 
 def l1_gain(loop: Loop, rows: Floats, amplitude: Floats) -> tuple[Floats, Floats]:
-    """Greatest value of ``rows @ state`` that disturbances within their amplitudes can ever cause, from the formation.
+    """Maximum value of ``rows @ state`` that disturbances within their amplitudes can ever cause, from the formation.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def l1_gain(loop: Loop, rows: Floats, amplitude: Floats) -> tuple[Floats, Floats
     rows : ndarray, shape (P, 3n - 1)
         Outputs.
     amplitude : ndarray, shape (4, n)
-        Greatest magnitude of w1 [m], w2 [m/s], w3 [m/s2] and of the measurement [m] in any step, any signal.
+        Maximum magnitude of w1 [m], w2 [m/s], w3 [m/s2] and of the measurement [m] in any step, any signal.
 
     Returns
     -------
@@ -209,7 +209,7 @@ def l1_gain(loop: Loop, rows: Floats, amplitude: Floats) -> tuple[Floats, Floats
     weights = np.tile(amplitude.reshape(-1), loop.held * together)
     per_norm = float((np.abs(responses) @ weights).max())
     best, left = np.zeros(len(rows)), np.zeros(len(rows))
-    for phase in range(loop.held):  # of the instant of the greatest value within the control period
+    for phase in range(loop.held):  # of the instant of the maximum value within the control period
         total, row = np.zeros(len(rows)), rows
         if phase:
             first, transition = _responses(loop, phase)
@@ -277,9 +277,9 @@ class Gain:
     worst_pair: tuple[str, str]
     worst_m: float
     tail_m: float  # the part of worst_m that is bounded instead of summed
-    speed_mps: float  # greatest |v_i - v0|
+    speed_mps: float  # maximum |v_i - v0|
     speed_room_mps: float
-    input_mps2: float  # greatest |u_c + w3|
+    input_mps2: float  # maximum |u_c + w3|
     input_room_mps2: float
     unsaturated: bool  # started from the formation, no clamp can ever act: the bound is unconditional
 
@@ -331,7 +331,7 @@ def gain(h: Floats, scene: Scene, amplitude: Floats) -> Gain:
     scene : Scene
         Graph, clamps, steps; the start does not matter.
     amplitude : ndarray, shape (5, n)
-        As of ``report``. The resistance error counts as a w3 of that share of the greatest resistance.
+        As of ``report``. The resistance error counts as a w3 of that share of the maximum resistance.
     """
     n = len(scene.trains)
     closed = loop(h, scene)

@@ -5,10 +5,10 @@ As printed, with one correction; in the paper's own example its assumptions have
 Symbols
 -------
 psi              all phat_i and phat_i + c_i vbar_i (position and speed errors in the moving formation)
-q_i, xi_a        weights a train hears with, summed; least weight of all [1/s2]
+q_i, xi_a        weights a train hears with, summed; minimum weight of all [1/s2]
 h, T             feedback gain [1/s], period [s]
-W1, W2, W3       greatest |w1| [m], |w2| [m/s], |w3| [m/s2]
-b1lo, B1         least and greatest magnitude a saturated speed error can have [m/s]
+W1, W2, W3       maximum |w1| [m], |w2| [m/s], |w3| [m/s2]
+b1lo, B1         minimum and maximum magnitude a saturated speed error can have [m/s]
 b2lo, B2         the same for the input less the resistance [m/s2]
 eta1, eta2       lower bounds of what the clamps leave of speed error and input, eqs. (10), (11), Lemma 1
 c                2 / (eta2 h) [s]
@@ -18,7 +18,7 @@ lambda1, lambda2 mubar^(2n); 2n (W1 + c W2 + c W3 T) [m]
 Correction
 ----------
 b2lo is printed as min{|theta_2hi - c0|, |theta_2lo - r_max|}. The input less the resistance saturates at theta_2hi - r, which is
-least where r is greatest: b2lo = min{theta_2hi - r_max, |theta_2lo| + r_min}.
+minimum where r is maximum: b2lo = min{theta_2hi - r_max, |theta_2lo| + r_min}.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Theorem:
     trains: list[str]
     h_t: list[float]
     q: list[float]  # 1/s2
-    kappa: float  # least ratio of input to resistance, Assumption 1
+    kappa: float  # minimum ratio of input to resistance, Assumption 1
     b1_low: list[float]
     b1_high: list[float]
     b2_low: list[float]  # corrected
@@ -91,7 +91,7 @@ class Theorem:
 
 
 def start_spread(p: Floats, v: Floats, c: Floats) -> float:
-    """Greatest |psi_l - psi_s| for position errors ``p`` [m], speed errors ``v`` [m/s] and ``c`` [s]."""
+    """Maximum |psi_l - psi_s| for position errors ``p`` [m], speed errors ``v`` [m/s] and ``c`` [s]."""
     return float(np.ptp(np.concatenate((p, p + c * v))))
 
 
@@ -105,7 +105,7 @@ def theorem_1(h: Floats, scene: Scene, amplitude: Floats) -> Theorem:
     scene : Scene
         The start.
     amplitude : ndarray, shape (3, n)
-        Greatest |w1| [m], |w2| [m/s], |w3| [m/s2].
+        Maximum |w1| [m], |w2| [m/s], |w3| [m/s2].
 
     Returns
     -------
@@ -113,7 +113,7 @@ def theorem_1(h: Floats, scene: Scene, amplitude: Floats) -> Theorem:
 
     Notes
     -----
-    eta2 stands on both sides of Assumption 2, since c = 2 / (eta2 h). Its greatest solution is found from eta2 = 1 downwards;
+    eta2 stands on both sides of Assumption 2, since c = 2 / (eta2 h). Its maximum solution is found from eta2 = 1 downwards;
     the right-hand side grows with eta2, so if the iteration goes to 0 there is none. "B1 i T" in its denominator is read as
     B1 / T, from |h vbar| <= B1 / T; B1 T or B1 h change nothing in the example.
     """
@@ -195,7 +195,7 @@ def theorem_1(h: Floats, scene: Scene, amplitude: Floats) -> Theorem:
 
 
 def _greatest_eta2(right_side: Callable[[Floats], Floats], n: int) -> Floats | None:
-    """Return the greatest solution of ``eta2 = right_side(eta2)`` in (0, 1], None if there is none; ``right_side`` is monotone."""
+    """Return the maximum solution of ``eta2 = right_side(eta2)`` in (0, 1], None if there is none; ``right_side`` is monotone."""
     eta2 = np.ones(n)
     for _ in range(100_000):
         new = right_side(eta2)
@@ -245,7 +245,7 @@ def report(h: Floats, scene: Scene, amplitude: Floats, constant: Floats | None) 
     scene : Scene
         The start.
     amplitude : ndarray, shape (5, n)
-        Greatest magnitudes, see ``plants.disturbance``.
+        Maximum magnitudes, see ``plants.disturbance``.
     constant : ndarray, shape (5, n), or None
         The disturbances, if they are constant.
     """

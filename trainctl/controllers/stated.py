@@ -21,13 +21,13 @@ def longest(data: Tables) -> float:
 
 
 def clear_distances(data: Tables) -> tuple[float, float, float]:
-    """Least, wanted and greatest distance of two trains [m] from the bounds of the links, the first two less the longest train."""
+    """Minimum, wanted and maximum distance of two trains [m] from the bounds of the links, the first two less the longest train."""
     body = longest(data)
     places = [data.get("topology", {}), *data.get("link", ())]
     lower = [float(place["lower_m"]) for place in places if np.isfinite(place.get("lower_m", np.inf))]
     upper = [float(place["upper_m"]) for place in places if np.isfinite(place.get("upper_m", np.inf))]
-    least = max(1.0, min(lower, default=1500.0 + body) - body)
-    return least, float(data.get("topology", {}).get("spacing_m", 3000.0 + body)) - body, max([10000.0, *upper])
+    minimum = max(1.0, min(lower, default=1500.0 + body) - body)
+    return minimum, float(data.get("topology", {}).get("spacing_m", 3000.0 + body)) - body, max([10000.0, *upper])
 
 
 def errors_allowed(data: Tables) -> list[float]:

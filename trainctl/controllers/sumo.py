@@ -50,7 +50,7 @@ class Params(Table):
         "Freight", "ICE1", "ICE3", "MireoPlusB", "MireoPlusH", "NGT400", "NGT400_16", "RB425", "RB628", "REDosto7"
     ] = Field("ICE3", description="SUMO's table of traction, resistance, mass and braking that drives the trains.")
     top_speed_mps: float | None = Field(
-        None, gt=0, description="Greatest speed of every train [m/s]; default its upper speed bound, else the reference's greatest."
+        None, gt=0, description="Maximum speed of every train [m/s]; default its upper speed bound, else the reference's maximum."
     )
     entry_m: float | None = Field(
         None, ge=0,

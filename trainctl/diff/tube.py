@@ -11,7 +11,7 @@ signal. Samples farther apart than ``GAP_S`` are not joined: a train that was aw
 no number breaks the curve; a value that is no number is inside if one of the reference's within w is none.
 
 Algorithm. A value within h of the curve at its own time is inside: one interpolation. For the others the cut is computed from all
-hulls that cover the time; the upper edge of a hull is the greatest of the lines through two of its four upper corners. Exact but
+hulls that cover the time; the upper edge of a hull is the maximum of the lines through two of its four upper corners. Exact but
 for rounding; the cost of a value outside is the number of samples within w.
 
 The same tubes, by way of corners and removed loops, in pyfunnel [1]_; there values outside the reference's ends are no comparison.

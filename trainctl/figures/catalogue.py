@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from trainctl.errors import InputError
 from trainctl.figures import style, trains, units
-from trainctl.figures.trains import Drawn, comparison, prepare
+from trainctl.figures.trains import Drawn, comparison, drawable
 from trainctl.laws import shipped
 from trainctl.runs.run import Run
 
@@ -22,7 +22,7 @@ __all__ = ["FIGURES", "applicable", "comparison", "figure", "plot"]
 
 FORMATS = ("png", "svg", "pdf")
 
-#: Every figure: name -> function of a prepared run.
+#: Every figure: name -> function of a drawable run.
 FIGURES: dict[str, Callable[[Drawn], Figure]] = {
     "train_graph": trains.train_graph,
     "positions": trains.positions,
@@ -98,7 +98,7 @@ def figure(run: Run, name: str, width: str = "double") -> Figure:
     if name not in FIGURES:
         raise InputError(f"figure {name}: not known; there are: {', '.join(FIGURES)}")
     with style.styled():
-        drawn = prepare(run, width)
+        drawn = drawable(run, width)
         if not _has(drawn, name):
             raise InputError(f"{run.folder}: nothing recorded for figure {name}")
         return FIGURES[name](drawn)
@@ -127,7 +127,7 @@ def plot(run: Run, out_dir: Path | str, formats: Sequence[str] = ("png",), width
     out.mkdir(parents=True, exist_ok=True)
     written = []
     with style.styled():
-        drawn = prepare(run, width)
+        drawn = drawable(run, width)
         for name, file in applicable(drawn).items():
             written += style.save(FIGURES[name](drawn), out / file, formats)
     return written

@@ -24,7 +24,7 @@ TRACK_STYLES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (5, 1.
 
 #: Column width and double width of a page in print [mm].
 WIDTHS_MM = {"single": 85.0, "double": 178.0}
-#: Points drawn per line at most; beyond, each stretch is drawn by its least and greatest value.
+#: Points drawn per line at most; beyond, each stretch is drawn by its minimum and maximum value.
 POINTS = 2000
 CROWD = 50  # lines
 #: A start so many times as large as the rest is left to the title of its panel.
@@ -80,7 +80,7 @@ def _order(handle: Any) -> list[tuple[int, int, str]]:
     """Lines by name, numbers by size, then what belongs to all lines."""
     label = str(handle.get_label())
     parts = re.findall(r"\d+|\D+", label)
-    common = label in ("desired", "reference", "cruising speed", "bound", "limit", "least allowed")
+    common = label in ("desired", "reference", "cruising speed", "bound", "limit", "minimum allowed")
     return [(int(common), 0, ""), *((0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts)]
 
 
@@ -119,7 +119,7 @@ def broken(x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def envelope(x: Floats, y: Floats, points: int = POINTS) -> tuple[Floats, Floats]:
-    """At most about ``points`` points of a line: of each of equal stretches the first, the least, the greatest and the last.
+    """At most about ``points`` points of a line: of each of equal stretches the first, the minimum, the maximum and the last.
 
     Nothing is averaged, so a peak of a single row keeps its height and its place. A gap (NaN) stays a gap.
     """
@@ -130,8 +130,8 @@ def envelope(x: Floats, y: Floats, points: int = POINTS) -> tuple[Floats, Floats
     keep = [starts, stops]
     for sign in (1.0, -1.0):
         value = np.where(np.isnan(y), np.inf, sign * y)
-        least = np.repeat(np.minimum.reduceat(value, starts), np.diff(edges))
-        hit = np.flatnonzero((value == least) & np.isfinite(value))
+        minimum = np.repeat(np.minimum.reduceat(value, starts), np.diff(edges))
+        hit = np.flatnonzero((value == minimum) & np.isfinite(value))
         keep.append(hit[np.unique(np.searchsorted(starts, hit, side="right"), return_index=True)[1]])
     keep.append(np.flatnonzero(np.isnan(y)))
     index = np.unique(np.concatenate(keep))
@@ -154,7 +154,7 @@ def focus(axes: Axes, time: Floats, low: Floats, high: Floats, after_s: float = 
     axes : Axes
         The panel.
     time, low, high : ndarray, shape (k,)
-        Time [s] and the least and greatest value drawn there.
+        Time [s] and the minimum and maximum value drawn there.
     after_s : float
         Length of the start [s].
     """
@@ -171,12 +171,12 @@ def focus(axes: Axes, time: Floats, low: Floats, high: Floats, after_s: float = 
     axes.set_title(f"beyond the scale in the first {after_s:g} s: {low.min():.4g} to {high.max():.4g}", loc="right", fontsize=7)
 
 
-def room(axes: Axes, least: float) -> None:
-    """Let the vertical axis span at least ``least``, so that rounding does not look like something."""
+def room(axes: Axes, minimum: float) -> None:
+    """Let the vertical axis span at least ``minimum``, so that rounding does not look like something."""
     low, high = axes.get_ylim()
-    if high - low < least:
+    if high - low < minimum:
         middle = 0.5 * (low + high)
-        axes.set_ylim(middle - 0.5 * least, middle + 0.5 * least)
+        axes.set_ylim(middle - 0.5 * minimum, middle + 0.5 * minimum)
 
 
 def save(figure: Figure, path: Path, formats: Sequence[str]) -> list[Path]:

@@ -30,7 +30,7 @@ ROUNDING = 1e-6
 
 
 def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
-    """Draw the complete runs over the first setting that is a number and varies, or else in order of size; broken bounds in red.
+    """Draw the complete runs over the first setting that is a number and varies, or else in order of size; violated bounds in red.
 
     Runs that gave nothing are counted in the title: what they would have shown may differ from the rest.
 
@@ -48,25 +48,25 @@ def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
     runs = f"{len(done)} of {len(frame)} runs complete, {', '.join(f'{n} {status}' for status, n in missing.items())}"
     shown = [key for key in SHOWN if key in done.columns and np.isfinite(done[key].to_numpy(float)).any()]
     axis = next((k for k in parameters if k != "run.seed" and done[k].dtype.kind in "if" and done[k].nunique() > 1), None)
-    broken = done["violations"].to_numpy(float) > 0
+    violated = done["violations"].to_numpy(float) > 0
     with style.styled():
         figure, axes = style.panels(max(1, len(shown)), "double", 34.0)
         for panel, key in zip(axes, shown, strict=False):
             value = done[key].to_numpy(float)
             if axis is None:
                 order = np.argsort(value, kind="stable")
-                at, value, red = np.arange(1, len(order) + 1), value[order], broken[order]
+                at, value, red = np.arange(1, len(order) + 1), value[order], violated[order]
             else:
-                at, red = done[axis].to_numpy(float), broken
+                at, red = done[axis].to_numpy(float), violated
                 places = np.unique(at)
                 middle = [np.nanmedian(value[at == x]) if np.isfinite(value[at == x]).any() else np.nan for x in places]
                 panel.plot(places, middle, color=style.GREY, label="median")
-            for chosen, colour, label in ((~red, 0, "all bounds held"), (red, 1, "a bound broken")):
+            for chosen, colour, label in ((~red, 0, "all bounds held"), (red, 1, "a bound violated")):
                 if chosen.any():
                     panel.plot(at[chosen], value[chosen], ".", markersize=3, color=style.COLOURS[colour], label=label)
-            least, most = np.nanmin(value), np.nanmax(value)
-            if most - least < ROUNDING:
-                panel.set_ylim(least - 1.0, most + 1.0)
+            minimum, most = np.nanmin(value), np.nanmax(value)
+            if most - minimum < ROUNDING:
+                panel.set_ylim(minimum - 1.0, most + 1.0)
             if key.startswith("bounds."):
                 panel.axhline(0.0, color="black", linestyle="--", linewidth=0.6)
             panel.set_ylabel(SHOWN[key])

@@ -13,15 +13,14 @@ from matplotlib.figure import Figure
 from trainctl.figures import style
 from trainctl.figures.trains import Drawn
 from trainctl.metrics.values import at_least, at_most
-from trainctl.runs.known import leader
-from trainctl.signals import Floats
+from trainctl.signals import Floats, leader_over
 
 #: Stretch of time of a magnified panel [s].
 ZOOM_S = 60.0
 
 
 def couplers(drawn: Drawn) -> Figure:
-    """Coupler displacements: shaded from least to greatest over the sub-steps, with the allowed range."""
+    """Coupler displacements: shaded from minimum to maximum over the sub-steps, with the allowed range."""
     figure, axes = style.panels(1, drawn.width, 52.0)
     low, high = at_most(drawn.units, "coupler_min_m", "coupler_m"), at_least(drawn.units, "coupler_max_m", "coupler_m")
     _bands(axes[0], drawn, drawn.units.column("coupler_m"), low, high, "coupler ")
@@ -42,7 +41,7 @@ def coupler_forces(drawn: Drawn) -> Figure:
 
 
 def unit_forces(drawn: Drawn) -> Figure:
-    """Forces of all units: shaded from least to greatest over the sub-steps, with the limits."""
+    """Forces of all units: shaded from minimum to maximum over the sub-steps, with the limits."""
     figure, axes = style.panels(1, drawn.width, 52.0)
     low, high = at_most(drawn.units, "force_min_n", "force_n"), at_least(drawn.units, "force_max_n", "force_n")
     _bands(axes[0], drawn, drawn.units.column("force_n") / 1000, low / 1000, high / 1000, "unit ")
@@ -157,14 +156,14 @@ def _bands(panel: Axes, drawn: Drawn, value: Floats, low: Floats, high: Floats, 
         label = f"{what}s of train {train}".replace(" s ", "s ") if train not in shown else f"_{name}"
         shown.add(train)
         if np.any(low[rows] < high[rows]):
-            (x, least), (_, greatest) = _floor(time[rows], low[rows], -1.0), _floor(time[rows], high[rows], 1.0)
-            panel.fill_between(x, least, greatest, color=colour, alpha=0.18, linewidth=0)
+            (x, minimum), (_, maximum) = _floor(time[rows], low[rows], -1.0), _floor(time[rows], high[rows], 1.0)
+            panel.fill_between(x, minimum, maximum, color=colour, alpha=0.18, linewidth=0)
         alpha = max(1.0 - 0.15 * (int(unit) - 1), 0.4) if unit.isdigit() else 1.0
         style.draw(panel, time[rows], value[rows], color=colour, label=label, alpha=alpha, linewidth=0.8)
 
 
 def _floor(x: Floats, y: Floats, sign: float) -> tuple[Floats, Floats]:
-    """The greatest (or least) of each of equal stretches, for shading long logs."""
+    """The maximum (or minimum) of each of equal stretches, for shading long logs."""
     stretches = max(len(x) // style.POINTS, 1)
     starts = np.arange(0, len(x), stretches)
     filled = np.where(np.isfinite(y), sign * y, -np.inf)
@@ -178,7 +177,7 @@ def _over_time(drawn: Drawn, column: str, label: str, scale: float, derivative: 
     _bands(axes[0], drawn, value, value, value, "unit ")
     if drawn.known.reference is not None:
         instants = drawn.instants
-        reference = leader(drawn.known.reference, instants)[derivative] / scale
+        reference = leader_over(drawn.known.reference, instants)[derivative] / scale
         style.draw(axes[0], instants, reference, color="black", linestyle=":", label="reference", zorder=3)
     axes[0].set_ylabel(label)
     return _finished(figure, axes, drawn)

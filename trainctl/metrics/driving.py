@@ -14,15 +14,15 @@ JOULES_PER_KWH = 3.6e6
 ELECTRIC_BRAKE_FROM_MPS = 10 / 3.6
 
 DEFINITIONS: dict[str, tuple[str, str]] = {
-    "units.coupler_min_m": ("m", "Greatest compression of a coupler over all sub-steps, negative."),
-    "units.coupler_max_m": ("m", "Greatest stretch of a coupler over all sub-steps."),
-    "units.coupler_stroke_m": ("m", "Largest difference between greatest stretch and greatest compression of one coupler."),
-    "units.coupler_force_min_n": ("N", "Greatest pushing coupler force at the recorded instants, negative."),
-    "units.coupler_force_max_n": ("N", "Greatest pulling coupler force at the recorded instants."),
-    "units.force_min_n": ("N", "Greatest braking force of a unit over all sub-steps, negative."),
-    "units.force_max_n": ("N", "Greatest tractive force of a unit over all sub-steps."),
-    "units.power_traction_max_w": ("W", "Greatest force times speed of a unit at the recorded instants."),
-    "units.power_braking_max_w": ("W", "Greatest braking force times speed of a unit at the recorded instants."),
+    "units.coupler_min_m": ("m", "Maximum compression of a coupler over all sub-steps, negative."),
+    "units.coupler_max_m": ("m", "Maximum stretch of a coupler over all sub-steps."),
+    "units.coupler_stroke_m": ("m", "Largest difference between maximum stretch and maximum compression of one coupler."),
+    "units.coupler_force_min_n": ("N", "Maximum pushing coupler force at the recorded instants, negative."),
+    "units.coupler_force_max_n": ("N", "Maximum pulling coupler force at the recorded instants."),
+    "units.force_min_n": ("N", "Maximum braking force of a unit over all sub-steps, negative."),
+    "units.force_max_n": ("N", "Maximum tractive force of a unit over all sub-steps."),
+    "units.power_traction_max_w": ("W", "Maximum force times speed of a unit at the recorded instants."),
+    "units.power_braking_max_w": ("W", "Maximum braking force times speed of a unit at the recorded instants."),
     "units.saturated_share": ("1", "Share of recorded train steps in which the law or a unit limit was saturated."),
     "energy.source": (
         "text", "Where the forces come from: integrated over the sub-steps; unit forces held between rows; input times mass held "
@@ -30,7 +30,7 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
     "energy.traction_kwh": ("kWh", "Work of tractive forces at the wheel."),
     "energy.braking_kwh": ("kWh", "Work of braking forces at the wheel, positive."),
     "energy.regenerable_kwh": ("kWh", "Part of the braking work done above 10 km/h, where electric brakes act; before losses."),
-    "energy.net_kwh": ("kWh", "Traction minus regenerable: the least that the supply would give."),
+    "energy.net_kwh": ("kWh", "Traction minus regenerable: the minimum that the supply would give."),
     "energy.traction_kwh_per_train_km": ("kWh/km", "Traction over distance covered by all trains."),
     "energy.net_kwh_per_train_km": ("kWh/km", "Net over distance covered by all trains."),
     "energy.traction_kwh_per_t": ("kWh/t", "As traction_kwh, per mass, where no mass is known."),

@@ -14,12 +14,12 @@ from trainctl.errors import InputError
 from trainctl.metrics import driving, traffic
 from trainctl.metrics.values import Values, at_least, at_most, put_worst
 from trainctl.monitors.outcome import GAP
-from trainctl.runs.known import UNBOUNDED, Facts, facts, leader
+from trainctl.runs.known import UNBOUNDED, Facts, facts
 from trainctl.runs.run import Run
 from trainctl.runs.series import INSTANT, Pairs, Series, pairs, series
-from trainctl.signals import Floats
+from trainctl.signals import Floats, leader_over
 
-#: A bound counts as broken beyond this (m, m/s or m/s2): positions read back from the simulator are exact to 3e-10 m.
+#: A bound counts as violated beyond this (m, m/s or m/s2): positions read back from the simulator are exact to 3e-10 m.
 SLACK = 1e-6
 
 #: name -> (unit, one-line definition)
@@ -28,18 +28,18 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
     "run.trains": ("1", "Trains in the log."),
     "run.train_km": ("km", "Distance covered by all trains together."),
     "bounds.spacing_lower_margin_m": (
-        "m", "Least spacing minus lower bound of a link, front to front, from one control period after the link was made on "
-        "(k >= 1: the first instant is given, not controlled); negative: broken."),
-    "bounds.spacing_upper_margin_m": ("m", "Least upper bound minus spacing of a link, counted in the same way."),
-    "bounds.speed_lower_margin_mps": ("m/s", "Least speed minus lower bound."),
-    "bounds.speed_upper_margin_mps": ("m/s", "Least upper bound minus speed."),
-    "bounds.input_lower_margin_mps2": ("m/s2", "Least applied input minus lower bound."),
-    "bounds.input_upper_margin_mps2": ("m/s2", "Least upper bound minus applied input."),
-    "bounds.coupler_lower_margin_m": ("m", "Least coupler displacement minus lower bound, over all sub-steps."),
-    "bounds.coupler_upper_margin_m": ("m", "Least upper bound minus coupler displacement, over all sub-steps."),
-    "bounds.broken": ("1", f"Number of kinds of bound (the eight margins above) broken by more than {SLACK:g} of their unit."),
-    "bounds.first_violation_s": ("s", "Time of the first recorded instant at which a bound is broken; absent if none is."),
-    "bounds.first_violation_who": ("text", "Which bound of whom is broken at that instant."),
+        "m", "Minimum spacing minus lower bound of a link, front to front, from one control period after the link was made on "
+        "(k >= 1: the first instant is given, not controlled); negative: violated."),
+    "bounds.spacing_upper_margin_m": ("m", "Minimum upper bound minus spacing of a link, counted in the same way."),
+    "bounds.speed_lower_margin_mps": ("m/s", "Minimum speed minus lower bound."),
+    "bounds.speed_upper_margin_mps": ("m/s", "Minimum upper bound minus speed."),
+    "bounds.input_lower_margin_mps2": ("m/s2", "Minimum applied input minus lower bound."),
+    "bounds.input_upper_margin_mps2": ("m/s2", "Minimum upper bound minus applied input."),
+    "bounds.coupler_lower_margin_m": ("m", "Minimum coupler displacement minus lower bound, over all sub-steps."),
+    "bounds.coupler_upper_margin_m": ("m", "Minimum upper bound minus coupler displacement, over all sub-steps."),
+    "bounds.broken": ("1", f"Number of kinds of bound (the eight margins above) violated by more than {SLACK:g} of their unit."),
+    "bounds.first_violation_s": ("s", "Time of the first recorded instant at which a bound is violated; absent if none is."),
+    "bounds.first_violation_who": ("text", "Which bound of whom is violated at that instant."),
     "formation.settling_s": (
         "s", "Time after which every link stays within the band (default 1 m) of its desired spacing; None: never."),
     "formation.window_settling_s": (
@@ -57,8 +57,8 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
         "1", "Norm over time of a link's spacing error over that of the link ahead of it (neighbours, common instants); "
         "above 1 errors grow along the formation."),
     "string.peak_gain": ("1", "The same with the largest absolute error as the norm."),
-    "watched.<name>_min": ("as named", "Least value over all sub-steps of a quantity that the law constrains."),
-    "watched.<name>_max": ("as named", "Greatest value over all sub-steps of a quantity that the law constrains."),
+    "watched.<name>_min": ("as named", "Minimum value over all sub-steps of a quantity that the law constrains."),
+    "watched.<name>_max": ("as named", "Maximum value over all sub-steps of a quantity that the law constrains."),
     **driving.DEFINITIONS,
     **traffic.DEFINITIONS,
 }  # fmt: skip
@@ -112,9 +112,9 @@ def metrics(run: Run, *, band_m: float = 1.0, speed_band: float = 0.02, section_
 
 
 def of_bounds(trains: Series, units: Series, links: Series, known: Facts) -> Values:
-    """Least margin to every bound, and the first instant at which one is broken."""
+    """Minimum margin to every bound, and the first instant at which one is violated."""
     values: Values = {}
-    broken: list[tuple[float, str]] = []
+    violated: list[tuple[float, str]] = []
     kinds: set[str] = set()
 
     def margins(name: str, split: Series, margin: Floats, what: str) -> None:
@@ -127,7 +127,7 @@ def of_bounds(trains: Series, units: Series, links: Series, known: Facts) -> Val
             time = split.column("time_s")[hit]
             k = int(np.argmin(time))
             where = split.names[int(split.labels()[hit[k]])]
-            broken.append((float(time[k]), f"{what} of {where} by {-margin[hit[k]]:.6g}"))
+            violated.append((float(time[k]), f"{what} of {where} by {-margin[hit[k]]:.6g}"))
 
     if links.names:
         counted = links.column("age_s") >= known.control_period_s - INSTANT
@@ -153,8 +153,8 @@ def of_bounds(trains: Series, units: Series, links: Series, known: Facts) -> Val
         margins("coupler_lower_margin_m", units, lowest - known.coupler_m[0], "lower coupler bound [m] behind unit")
         margins("coupler_upper_margin_m", units, known.coupler_m[1] - highest, "upper coupler bound [m] behind unit")
     values["bounds.broken"] = len(kinds)
-    if broken:
-        values["bounds.first_violation_s"], values["bounds.first_violation_who"] = min(broken)
+    if violated:
+        values["bounds.first_violation_s"], values["bounds.first_violation_who"] = min(violated)
     return values
 
 
@@ -206,7 +206,7 @@ def of_reference(trains: Series, known: Facts, band: float) -> Values:
         return {}
     values: Values = {}
     time, speed = trains.column("time_s"), trains.column("speed_mps")
-    error = speed - leader(known.reference, time)[1]
+    error = speed - leader_over(known.reference, time)[1]
     last = np.abs(time - time.max()) < INSTANT
     put_worst(values, "formation.final_speed_error_mps", trains, np.where(last, np.abs(error), -np.inf), np.maximum)
     overshoot = np.zeros(len(time))

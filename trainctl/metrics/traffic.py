@@ -33,18 +33,18 @@ TRIPINFO = {
 DEFINITIONS: dict[str, tuple[str, str]] = {
     "traffic.gap_min_m": (
         "m",
-        "Least distance from the rear of the train ahead to the front of a train; negative: they overlap.",
+        "Minimum distance from the rear of the train ahead to the front of a train; negative: they overlap.",
     ),
-    "traffic.spacing_min_m": ("m", "Least distance from front to front of a train and the one ahead."),
+    "traffic.spacing_min_m": ("m", "Minimum distance from front to front of a train and the one ahead."),
     "traffic.spacing_mean_m": ("m", "Mean of that distance over all rows."),
-    "traffic.headway_min_s": ("s", "Least spacing over the follower's speed, for trains faster than 1 m/s."),
+    "traffic.headway_min_s": ("s", "Minimum spacing over the follower's speed, for trains faster than 1 m/s."),
     "traffic.headway_mean_s": ("s", "Mean of that headway over all rows."),
     "traffic.speed_mean_mps": ("m/s", "Mean speed over all rows."),
-    "traffic.speed_max_mps": ("m/s", "Greatest speed."),
+    "traffic.speed_max_mps": ("m/s", "Maximum speed."),
     "traffic.section_m": ("m", "Kilometrage at which passages are counted."),
     "traffic.passages": ("1", "Trains whose front passed the section."),
     "traffic.trains_per_hour": ("1/h", "Passages less one over the time from the first to the last of them; per track as items."),
-    "traffic.passage_headway_min_s": ("s", "Least time between two fronts at the section on one track."),
+    "traffic.passage_headway_min_s": ("s", "Minimum time between two fronts at the section on one track."),
     "traffic.sumo_trips": ("1", "Trips that SUMO saw arrive (tripinfo)."),
     TRIPINFO["duration"]: ("s", "Mean journey time of these trips."),
     TRIPINFO["routeLength"]: ("m", "Mean route length."),
@@ -61,11 +61,11 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
     "fcd.rows": ("1", "FCD log: rows."),
     "fcd.vehicles_mean": ("1", "FCD log: mean number of vehicles per such step."),
     "fcd.speed_mean_mps": ("m/s", "FCD log: mean speed over all rows."),
-    "fcd.speed_max_mps": ("m/s", "FCD log: greatest speed."),
+    "fcd.speed_max_mps": ("m/s", "FCD log: maximum speed."),
     "fcd.standing_share": ("1", "FCD log: share of rows below 0.1 m/s."),
-    "fcd.spacing_min_m": ("m", "FCD log: least distance from front to front on one lane (needs pos and lane)."),
+    "fcd.spacing_min_m": ("m", "FCD log: minimum distance from front to front on one lane (needs pos and lane)."),
     "fcd.spacing_mean_m": ("m", "FCD log: mean of that distance."),
-    "fcd.headway_min_s": ("s", "FCD log: least spacing over the follower's speed, for vehicles faster than 1 m/s."),
+    "fcd.headway_min_s": ("s", "FCD log: minimum spacing over the follower's speed, for vehicles faster than 1 m/s."),
     "fcd.headway_mean_s": ("s", "FCD log: mean of that headway."),
 }
 
@@ -192,7 +192,7 @@ def _of_rows(batches: Iterable[pa.Table], path: Path) -> Values:
     }  # fmt: skip
     for name, unit, mean in (("spacing", "m", spacing), ("headway", "s", headway)):
         if mean.count:
-            values |= {f"fcd.{name}_min_{unit}": mean.least, f"fcd.{name}_mean_{unit}": mean.total / mean.count}
+            values |= {f"fcd.{name}_min_{unit}": mean.minimum, f"fcd.{name}_mean_{unit}": mean.total / mean.count}
     return values
 
 
@@ -208,12 +208,12 @@ def _spacings(batch: pa.Table) -> tuple[Floats, Floats]:
 
 
 class _Mean:
-    """Mean and least value of numbers that come in pieces."""
+    """Mean and minimum value of numbers that come in pieces."""
 
     def __init__(self) -> None:
-        self.count, self.total, self.least = 0, 0.0, np.inf
+        self.count, self.total, self.minimum = 0, 0.0, np.inf
 
     def add(self, numbers: Floats) -> None:
         if len(numbers):
             self.count, self.total = self.count + len(numbers), self.total + float(numbers.sum())
-            self.least = min(self.least, float(numbers.min()))
+            self.minimum = min(self.minimum, float(numbers.min()))

@@ -30,7 +30,7 @@ def at_most(split: Series, *columns: str) -> Floats:
 
 
 def at_least(split: Series, *columns: str) -> Floats:
-    """Greatest of some columns, whichever exist and are finite; NaN where none is."""
+    """Maximum of some columns, whichever exist and are finite; NaN where none is."""
     return _folded(split, columns, np.fmax)
 
 

@@ -21,7 +21,7 @@ from trainctl.signals import Floats, Ints
 
 if TYPE_CHECKING:
     from trainctl.railway.ways import Ways
-    from trainctl.scenario.model import Prepared
+    from trainctl.scenario.model import Model
     from trainctl.signals import Row, Seen
     from trainctl.stages.traffic import Around
     from trainctl.stages.traffic import State as Traffic
@@ -34,7 +34,7 @@ def _alarm(bound: str, who: str, value: float, limit: float) -> Alarm:
 
 
 class State(NamedTuple):
-    """What has been broken so far, and what that is told from; overwritten in place."""
+    """What has been violated so far, and what that is told from; overwritten in place."""
 
     tally: Tally
     last: Floats  # (n,) m, fronts a step ago, see ``on_track``
@@ -45,9 +45,9 @@ class State(NamedTuple):
 
 
 class Alarms:
-    """Tells what is broken for the first time. Its methods update the ``State`` they are given."""
+    """Tells what is violated for the first time. Its methods update the ``State`` they are given."""
 
-    def __init__(self, p: Prepared) -> None:
+    def __init__(self, p: Model) -> None:
         self.p = p
         self.watch = on_track.of(p)
         self.waiting = Waiting(p.scenario.ids, p.line.edges, p.driving.wait_limit_s)
@@ -55,7 +55,7 @@ class Alarms:
         self.energy = energy.Balance(p) if p.has_units else None
 
     def initial(self) -> State:
-        """Nothing broken yet."""
+        """Nothing violated yet."""
         n = len(self.p.scenario.train)
         free = np.stack([np.full((n, len(self.watched)), -np.inf), np.full((n, len(self.watched)), np.inf)])
         return State(
@@ -64,8 +64,8 @@ class Alarms:
         )  # fmt: skip
 
     def new(self, row: Row, ways: Ways, here: Seen, s: State) -> Iterator[Alarm]:
-        """What is broken in this row for the first time, as fields of an event; ``here`` is where the world has the trains."""
-        for alarm in chain(self._all(row, s), self.watch.broken(ways, here, row.speed, s.last)):
+        """What is violated in this row for the first time, as fields of an event; ``here`` is where the world has the trains."""
+        for alarm in chain(self._all(row, s), self.watch.violated(ways, here, row.speed, s.last)):
             yield from s.tally.once(row.time, **alarm)
 
     def counted(self, end: float, collisions: Sequence[Mapping[str, Any]], s: State) -> Iterator[tuple[float, Alarm]]:
@@ -119,11 +119,11 @@ class Alarms:
         links = row.links
         spacing = row.seen.position[links.sender] - row.seen.position[links.receiver]
         ahead = spacing > 0.0  # each pair once
-        for key, bound, broken in (
+        for key, bound, violated in (
             ("spacing_lower_m", links.lower, spacing < links.lower - ROUNDING),
             ("spacing_upper_m", links.upper, spacing > links.upper + ROUNDING),
         ):
-            for k in np.flatnonzero(broken & ahead).tolist():
+            for k in np.flatnonzero(violated & ahead).tolist():
                 yield _alarm(key, f"{ids[links.sender[k]]}-{ids[links.receiver[k]]}", float(spacing[k]), float(bound[k]))
 
     def _couplers(self, row: Row) -> Iterator[Alarm]:
@@ -131,11 +131,11 @@ class Alarms:
         p, x, bounds = self.p, row.extremes, self.p.scenario.bounds
         if x is None or bounds.coupler_lower_m is None or bounds.coupler_upper_m is None:
             return
-        for key, value, bound, broken in (
+        for key, value, bound, violated in (
             ("coupler_lower_m", x.coupler_min, bounds.coupler_lower_m, x.coupler_min < bounds.coupler_lower_m),
             ("coupler_upper_m", x.coupler_max, bounds.coupler_upper_m, x.coupler_max > bounds.coupler_upper_m),
         ):
-            for u in np.flatnonzero(broken).tolist():
+            for u in np.flatnonzero(violated).tolist():
                 i = int(np.searchsorted(p.consists.first, u, side="right")) - 1
                 yield _alarm(key, f"{p.scenario.ids[i]}.{u - p.consists.first[i] + 1}", float(value[u]), bound)
 
@@ -151,11 +151,11 @@ class Alarms:
         low, high = s.during.copy()
         s.during[:] = s.now
         seen = x.watched_min <= x.watched_max
-        for side, value, bound, broken in (
+        for side, value, bound, violated in (
             ("lower", x.watched_min, low, seen & (x.watched_min < low - ROUNDING)),
             ("upper", x.watched_max, high, seen & (x.watched_max > high + ROUNDING)),
         ):
-            for i, q in np.argwhere(broken).tolist():
+            for i, q in np.argwhere(violated).tolist():
                 stem, _, unit = self.watched[q].rpartition("_")
                 yield _alarm(f"{stem}_{side}_{unit}", self.p.scenario.ids[i], float(value[i, q]), float(bound[i, q]))
 
@@ -164,7 +164,7 @@ class Alarms:
         if self.energy is None:
             return
         assert isinstance(s.energy, energy.State)
-        for i, share in self.energy.broken(row, s.energy):
+        for i, share in self.energy.violated(row, s.energy):
             yield _alarm("energy_balance_share", self.p.scenario.ids[i], share, self.energy.LIMIT)
 
     def waits(
@@ -193,6 +193,6 @@ class Alarms:
         more = {"gridlocks": len(counted["circles"]), "waited_long": counted["long"], "not_entered": not_entered}
         return s.tally.outcome(self.p.supervision.mode == "on", more)
 
-    def _per_train(self, key: str, value: Floats, bound: Floats, broken: Any) -> Iterator[Alarm]:
-        for i in np.flatnonzero(broken).tolist():
+    def _per_train(self, key: str, value: Floats, bound: Floats, violated: Any) -> Iterator[Alarm]:
+        for i in np.flatnonzero(violated).tolist():
             yield _alarm(key, self.p.scenario.ids[i], float(value[i]), float(bound[i]))

@@ -10,7 +10,7 @@ import numpy as np
 from trainctl.signals import POSITION, SPEED, Floats, Row
 
 if TYPE_CHECKING:
-    from trainctl.scenario.model import Prepared
+    from trainctl.scenario.model import Model
     from trainctl.signals import Row
 
 #: Signs of ``signals.POWERS`` in the balance.
@@ -35,15 +35,15 @@ class Balance:
     #: Largest share of the turnover that may come from nowhere.
     LIMIT = 1e-3
 
-    def __init__(self, p: Prepared) -> None:
+    def __init__(self, p: Model) -> None:
         c = p.consists
-        self.heads, self.units = c.first[:-1], np.diff(c.first)
+        self.leading, self.units = c.first[:-1], np.diff(c.first)
         self.inertia, self.stiffness, self.length = c.mass * c.rotating, c.stiffness.copy(), c.length
         self.stiffness[c.first[1:] - 1] = 0.0  # no coupler behind the last unit
 
     def initial(self) -> State:
         """Nothing seen yet."""
-        n = len(self.heads)
+        n = len(self.leading)
         return State(np.full(n, np.nan), np.zeros(n), np.zeros(n), np.zeros(n))
 
     def energy(self, own: Floats) -> Floats:
@@ -51,10 +51,10 @@ class Balance:
         each = 0.5 * self.inertia * own[:, SPEED] ** 2
         stretch = own[:-1, POSITION] - own[1:, POSITION] - self.length[:-1]
         each[:-1] += 0.5 * self.stiffness[:-1] * stretch**2
-        total: Floats = np.add.reduceat(each, self.heads)
+        total: Floats = np.add.reduceat(each, self.leading)
         return total
 
-    def broken(self, row: Row, s: State) -> Iterator[tuple[int, float]]:
+    def violated(self, row: Row, s: State) -> Iterator[tuple[int, float]]:
         """Trains out of balance now, and by which share of their turnover. Every step's row must come by."""
         if row.extremes is not None:
             now = self.energy(row.own)
@@ -69,4 +69,4 @@ class Balance:
                 yield i, float(s.drift[i] / max(s.turnover[i], ROUNDING * now[i]))
         if row.disturbed is not None and row.disturbed.speed.any():
             kick = np.repeat(row.disturbed.speed, self.units)
-            s.kicked[:] += np.add.reduceat(self.inertia * (row.own[:, SPEED] + 0.5 * kick) * kick, self.heads)
+            s.kicked[:] += np.add.reduceat(self.inertia * (row.own[:, SPEED] + 0.5 * kick) * kick, self.leading)

@@ -19,7 +19,7 @@ from trainctl.railway.ways import Ways
 from trainctl.signals import Bools, Floats, Ints
 
 if TYPE_CHECKING:
-    from trainctl.scenario.model import Prepared
+    from trainctl.scenario.model import Model
     from trainctl.signals import Seen
 
 keep_by_sources()  # before anything below is decorated
@@ -99,7 +99,7 @@ class Watch:
         """Front of every train a step ago [m], shape (n,); NaN where it was not there."""
         return np.full(len(self.length), np.nan)
 
-    def broken(self, ways: Ways, seen: Seen, speed: Floats, last: Floats) -> Iterator[dict[str, Any]]:
+    def violated(self, ways: Ways, seen: Seen, speed: Floats, last: Floats) -> Iterator[dict[str, Any]]:
         """What is wrong now, as fields of an event; ``seen`` counts as the ways do, ``speed`` (n,) [m/s].
 
         ``last`` (n,), where the fronts were a step ago, is overwritten in place.
@@ -122,7 +122,7 @@ class Watch:
             }  # fmt: skip
 
 
-def of(p: Prepared) -> Watch:
+def of(p: Model) -> Watch:
     """The watch over the trains of a scenario."""
     return Watch(p.scenario.ids, p.consists.train_length(), p.roster.speed_factor, p.rails, p.line, not p.placed)
 

@@ -1,4 +1,4 @@
-"""What was broken in a run, how often and how far, and what of it fails the run: the one list that exit codes go by."""
+"""What was violated in a run, how often and how far, and what of it fails the run: the one list that exit codes go by."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ GAP, LIMIT, COUNTED = "gap_m", "line_speed_mps", "sumo_collision"
 
 
 class Tally(NamedTuple):
-    """What was broken so far, in plain JSON; updated in place."""
+    """What was violated so far, in plain JSON; updated in place."""
 
-    broken: dict[str, dict[str, int]]  # bound -> who -> steps or rows in which it was broken; of a pair in order of its ids
+    violated: dict[str, dict[str, int]]  # bound -> who -> steps or rows in which it was violated; of a pair in order of its ids
     first: dict[str, Any]  # the first violation: time [s], bound, who, value, limit; empty: none
     worst: dict[str, dict[str, Any]]  # by bound, the farthest overlap and overspeed: time [s], who, value, limit
     pairs: list[list[str]]  # trains that collided
 
     @classmethod
     def empty(cls) -> Tally:
-        """Nothing was broken."""
+        """Nothing was violated."""
         return cls({}, {}, {}, [])
 
     def once(self, time: float, bound: str, who: str, value: float, limit: float, **more: Any) -> Iterator[dict[str, Any]]:
-        """Count something broken; the first time it is given back, as fields of an event."""
+        """Count something violated; the first time it is given back, as fields of an event."""
         pair = sorted(more.get("trains", ()))
-        counts, name = self.broken.setdefault(bound, {}), "-".join(pair) if pair else who
+        counts, name = self.violated.setdefault(bound, {}), "-".join(pair) if pair else who
         seen = counts.get(name, 0)
         counts[name] = seen + 1
         told = {"who": who, "value": value, "limit": limit}
@@ -56,12 +56,12 @@ class Tally(NamedTuple):
         more : mapping
             Numbers of gridlocks, waits and trains that did not enter.
         """
-        collisions, overspeeds = len(self.pairs), len(self.broken.get(LIMIT, {}))
+        collisions, overspeeds = len(self.pairs), len(self.violated.get(LIMIT, {}))
         failed = {
             "collision": collisions > 0, "overspeed": overspeeds > 0 and supervised, "gridlock": more.get("gridlocks", 0) > 0,
         }  # fmt: skip
         return {
-            "violations": sum(map(len, self.broken.values())), "first_violation": self.first or None, "collisions": collisions,
+            "violations": sum(map(len, self.violated.values())), "first_violation": self.first or None, "collisions": collisions,
             "overspeeds": overspeeds, **more, "worst": self.worst,
             "checks_failed": [name for name, is_so in failed.items() if is_so],
         }  # fmt: skip

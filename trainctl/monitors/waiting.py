@@ -75,7 +75,7 @@ def waits(
         targets, clear = parts[0], parts[0] if view.targets is view.clear else parts[1]
         verdict = authority.judge(rules, none, targets, clear, supervisor.no_limits(), step, theta, assumed, none)
         others = np.concatenate([targets.other, clear.other])
-        for i in np.flatnonzero(stand & (verdict.reason >= 0) & (verdict.greatest * step < STANDS_MPS)).tolist():
+        for i in np.flatnonzero(stand & (verdict.reason >= 0) & (verdict.maximum * step < STANDS_MPS)).tolist():
             if switch:
                 found.append(Wait(i, int(held.by[i]), int(held.zone[i]), SWITCH))
             else:

@@ -165,7 +165,7 @@ def tolerated_speed_offset(params: Params, scene: Scene) -> float:
 
     An error of the speed estimate enters the acceleration estimate r times (50 m/s2 per m/s), and the law pushes the train the
     other way until it has gone. Measured on the paper's start, without force limits: with poles -1, -2, -3 and -6 this much keeps
-    all bounds, with -3 twice as much fails within a second. Common errors of position do no harm: heads measure theirs.
+    all bounds, with -3 twice as much fails within a second. Common errors of position do no harm: leading units measure theirs.
     """
     slowest = float(np.max(params.pole_per_s))
     return 0.5 * (slowest / 3.0) ** 2 * 50.0 / float(scene.consists.actuator_rate.max())

@@ -102,9 +102,9 @@ def violations(params: Params, scene: Scene, faults: Sequence[Fault] = ()) -> li
     found = [*coupled_units.too_stiff(params, scene), *fault_violations(faults, scene.trains, scene.consists)]
     first, rate = scene.consists.first, scene.consists.actuator_rate
     for i, train in enumerate(scene.trains):
-        least = rate[first[i] : first[i + 1]].min()
-        if least <= 0.0:
-            found.append(f"actuator_rate_per_s = {least:g}: must be above 0 for train {train} in actuated_units")
+        minimum = rate[first[i] : first[i + 1]].min()
+        if minimum <= 0.0:
+            found.append(f"actuator_rate_per_s = {minimum:g}: must be above 0 for train {train} in actuated_units")
     # Stiffness through a first-order lag swings up: s**3 + r s**2 + a r (d s + k) = 0 is stable for k < r d, whatever a > 0.
     most = 0.5 * params.in_train_damping_per_s * float(rate.min())
     if params.in_train_stiffness_per_s2 > most:

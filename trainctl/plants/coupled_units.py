@@ -268,8 +268,8 @@ def room(consists: Consists, lower: Floats, upper: Floats) -> tuple[Floats, Floa
 
     Notes
     -----
-    Each unit carries its own mass's share, so the unit weakest per mass decides, traction at the speed where power leaves
-    least. Where rotating mass or Davis coefficients differ between units, their share of the input does too: it is taken at
+    Each unit carries its own mass's share, so the unit weakest per mass decides, traction at the speed where power leaves the
+    minimum. Where rotating mass or Davis coefficients differ between units, their share of the input does too: it is taken at
     161 speeds of the band.
     """
     low, high = np.full(len(lower), -np.inf), np.full(len(lower), np.inf)
@@ -290,8 +290,8 @@ def room(consists: Consists, lower: Floats, upper: Floats) -> tuple[Floats, Floa
 
 def sure_braking(params: Any, consists: Consists, top: Floats) -> Floats:
     """Deceleration every train can give on the level at any speed up to ``top`` (n,) [m/s2], shape (n,)."""
-    least, _ = room(consists, np.zeros_like(top), top)
-    return -least
+    minimum, _ = room(consists, np.zeros_like(top), top)
+    return -minimum
 
 
 def relied_on(
@@ -300,13 +300,15 @@ def relied_on(
 ) -> Reliance:  # fmt: skip
     """As ``signals.Plant`` says: units act at once, each as far as its own brakes and faults let it."""
     share, bias = actuators.shares(faults, trains, consists)
-    units, heads = np.diff(consists.first), consists.first[:-1]
+    units, leading = np.diff(consists.first), consists.first[:-1]
     inertia = consists.mass * consists.rotating
-    total = np.add.reduceat(inertia, heads)
+    total = np.add.reduceat(inertia, leading)
     fastest = np.maximum(np.repeat(top, units), 1e-9)
     force = np.minimum(consists.braking, consists.braking_power / fastest)
-    down, weight = np.repeat(fall, units), np.add.reduceat(consists.mass, heads)
-    given = np.add.reduceat(share * np.minimum(force, inertia * braking + consists.mass * down), heads) - weight * fall
-    pull = np.add.reduceat(share * np.minimum(consists.traction, consists.traction_power / fastest), heads) / consists.train_mass()
+    down, weight = np.repeat(fall, units), np.add.reduceat(consists.mass, leading)
+    given = np.add.reduceat(share * np.minimum(force, inertia * braking + consists.mass * down), leading) - weight * fall
+    pull = (
+        np.add.reduceat(share * np.minimum(consists.traction, consists.traction_power / fastest), leading) / consists.train_mass()
+    )
     zero = np.zeros(len(top))
-    return Reliance(given / total, pull, np.add.reduceat(bias, heads) / total, zero, zero, zero)
+    return Reliance(given / total, pull, np.add.reduceat(bias, leading) / total, zero, zero, zero)

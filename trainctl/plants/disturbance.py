@@ -129,8 +129,8 @@ class Disturbance(Table):
         """Trains named; ("all",) for all."""
         return tuple(str(t) for t in self.train) if isinstance(self.train, tuple) else (str(self.train),)
 
-    def greatest(self, trains: Sequence[str], deviations: float = math.inf) -> Floats:
-        """Greatest magnitude on each channel of each of all ``trains``, shape (5, n).
+    def maximum(self, trains: Sequence[str], deviations: float = math.inf) -> Floats:
+        """Maximum magnitude on each channel of each of all ``trains``, shape (5, n).
 
         Windows in time and place are ignored. A Gaussian that no amplitude cuts off has no bound: it is taken to stay within so
         many standard ``deviations``. The row of the resistance is a relative error, not a factor.
@@ -174,8 +174,8 @@ class Disturbance(Table):
             if getattr(self, key) is None:
                 wrong.append(f"{key}: missing, shape = {self.shape} needs it")
         if gaussian:
-            least = [key for key in (self.std_key, self.amplitude_key) if np.min(getattr(self, key) or 0.0) < 0]
-            wrong += [f"{key} = {getattr(self, key)}: must not be negative with shape = gaussian" for key in least]
+            minimum = [key for key in (self.std_key, self.amplitude_key) if np.min(getattr(self, key) or 0.0) < 0]
+            wrong += [f"{key} = {getattr(self, key)}: must not be negative with shape = gaussian" for key in minimum]
         if self.to_s is not None and self.to_s <= (self.from_s or 0.0):
             wrong.append(f"to_s = {self.to_s:g}: must be after from_s = {self.from_s or 0.0:g}")
         if self.from_m is not None and self.to_m is not None and self.to_m <= self.from_m:
@@ -243,7 +243,7 @@ def violations(entries: Sequence[Disturbance], trains: Sequence[str], seed: int 
     return found
 
 
-def prepare(
+def signals(
     entries: Sequence[Disturbance], trains: Sequence[str], step: float, seed: int | None, worst: Worst | None = None
 ) -> Signals:
     """Arrays of all disturbances of a run.
@@ -313,7 +313,7 @@ def at(signals: Signals, k: int, t: float, position: Floats) -> Disturbed:
     Parameters
     ----------
     signals : Signals
-        From ``prepare``.
+        From ``signals``.
     k : int
         Number of the step, 0 for the first of the run.
     t : float

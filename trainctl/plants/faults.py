@@ -101,7 +101,7 @@ def refused(plant: str, faults: Sequence[Fault]) -> list[str]:
 
 
 def shares(faults: Sequence[Fault], trains: Sequence[str], consists: Consists) -> tuple[Floats, Floats]:
-    """Share of the demanded force every unit surely gives, and the greatest bias of its force [N], shape (U,)."""
+    """Share of the demanded force every unit surely gives, and the maximum bias of its force [N], shape (U,)."""
     share, bias = np.ones(len(consists.mass)), np.zeros(len(consists.mass))
     for fault in faults:
         u = int(consists.first[trains.index(fault.train)]) + fault.unit - 1

@@ -37,13 +37,13 @@ class Params(Table):
     """Keys of ``[plant]`` with ``kind = "point"``: clamps that are part of the plant. None by default."""
 
     input_lower_mps2: float | None = Field(
-        default=None, description="least applied input, end of U [m/s2]; robust_constrained eq. (4)"
+        default=None, description="minimum applied input, end of U [m/s2]; robust_constrained eq. (4)"
     )
     input_upper_mps2: float | None = Field(
-        default=None, description="greatest applied input, end of U [m/s2]; robust_constrained eq. (4)"
+        default=None, description="maximum applied input, end of U [m/s2]; robust_constrained eq. (4)"
     )
-    speed_lower_mps: float | None = Field(default=None, description="least speed, end of V [m/s]; robust_constrained eq. (4)")
-    speed_upper_mps: float | None = Field(default=None, description="greatest speed, end of V [m/s]; robust_constrained eq. (4)")
+    speed_lower_mps: float | None = Field(default=None, description="minimum speed, end of V [m/s]; robust_constrained eq. (4)")
+    speed_upper_mps: float | None = Field(default=None, description="maximum speed, end of V [m/s]; robust_constrained eq. (4)")
 
     @field_validator("input_upper_mps2", "speed_upper_mps")
     @classmethod

@@ -8,7 +8,7 @@ Symbols
 -------
 a_i         acceleration train i holds [m/s2]; where orders replace a law, NaN leaves the train to the law
 mu, Mu      lower and upper bound of the input, force per mass [m/s2]
-f, F        least and largest running resistance over the speed band [m/s2]
+f, F        minimum and largest running resistance over the speed band [m/s2]
 rho, Rho    lower and upper speed bound [m/s]
 T           control period [s]
 """

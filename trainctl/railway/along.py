@@ -60,7 +60,7 @@ class Net(NamedTuple):
 
 
 class Order(NamedTuple):
-    """Turns decided at joins, see ``claims``: train[q] is number rank[q] over edge[q]."""
+    """Turns decided at joins, see ``interlocking``: train[q] is number rank[q] over edge[q]."""
 
     edge: Ints  # (Q,)
     train: Ints  # (Q,)

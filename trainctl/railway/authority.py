@@ -31,7 +31,7 @@ class View(NamedTuple):
     limits: Limits
     room: Floats  # (n,) m, to the body on the own way that surely is there; inf: none
     body: Ints  # (n,) whose it is, -1: none
-    fouling: Bools  # (n,) its tail lies on another train behind the beginning of its way, see ``topology.bodies``
+    fouling: Bools  # (n,) its tail lies on another train behind the beginning of its way, see ``railway.bodies``
 
 
 def look(
@@ -47,7 +47,7 @@ def look(
     net : Net
         Of the railway, see ``along.net``.
     limit : ndarray, shape (E,)
-        Greatest speed on every edge [m/s].
+        Maximum speed on every edge [m/s].
     factor : ndarray, shape (n,)
         Share of that which every train keeps to.
     row, s, speed, length, present : ndarray, shape (n,)
@@ -57,7 +57,7 @@ def look(
     held : ndarray, shape (n,)
         How far every front may go because what comes then is another train's turn [m]; inf: as far as it likes.
     order : Order, optional
-        Turns that are decided, see ``topology.claims``.
+        Turns that are decided, see ``interlocking.order``.
 
     Returns
     -------
@@ -147,11 +147,11 @@ def judge(
     if targets is clear:
         return follows
     waits = verdict(params, speed, clear, limits, step, theta, assumed, acceleration, swing)
-    other = waits.greatest > follows.greatest
+    other = waits.maximum > follows.maximum
     waits = waits._replace(target=waits.target + np.where((waits.reason >= 0) & (waits.reason != LIMIT), len(targets.train), 0))
     return Verdict(
-        greatest=np.where(other, waits.greatest, follows.greatest),
-        least=follows.least,
+        maximum=np.where(other, waits.maximum, follows.maximum),
+        minimum=follows.minimum,
         emergency=np.where(other, waits.emergency, follows.emergency),
         reason=np.where(other, waits.reason, follows.reason),
         target=np.where(other, waits.target, follows.target),

@@ -2,8 +2,9 @@
 
 Two kinds of places. A *join* is an edge that two or more edges lead into: the trains get a turn there, nobody is held, and the
 turns go to ``along.places``. A *stretch* is a longest run of edges on a train's way that others use as well, on the twin (single
-track) or across: it is exclusive against those, while trains that go the same way may follow each other. A train claims what lies
-within its reach, and keeps its claim until its rear has left or its way no longer leads there. What it has passed is free at once.
+track) or across: it is exclusive against those, while trains that go the same way may follow each other. A train requests what
+lies within its reach, and keeps its request until its rear has left or its way no longer leads there. What it has passed is free
+at once.
 
 Deadlock: a train is let into a stretch only if behind it, before the next stretch, it finds room to stand with all who will stand
 there, or else together with the next one. While it waits for that, later trains may overtake it; this is the only exception to
@@ -27,11 +28,11 @@ keep_by_sources()  # before anything below is decorated
 
 
 class State(TypedDict):
-    """All claims, in the plain types of JSON."""
+    """All requests, in the plain types of JSON."""
 
     joins: dict[str, list[int]]  # edge number: trains in the order of their turns
-    stretches: list[tuple[int, int, bool]]  # train, edge it enters over, granted; in the order of claiming
-    until: dict[str, float]  # train number: position up to which it has claimed [m]
+    stretches: list[tuple[int, int, bool]]  # train, edge it enters over, granted; in the order of requesting
+    until: dict[str, float]  # train number: position up to which it has requested [m]
 
 
 class Zones(NamedTuple):
@@ -53,7 +54,7 @@ class Held(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """One claim decided: granted, or not because of train ``by``. At a join, not granted means after ``by``."""
+    """One request decided: granted, or not because of train ``by``. At a join, not granted means after ``by``."""
 
     train: int
     zone: int
@@ -63,7 +64,7 @@ class Decision(NamedTuple):
 
 
 def none() -> State:
-    """No claims: the state to begin with."""
+    """No requests: the state to begin with."""
     return State(joins={}, stretches=[], until={})
 
 
@@ -83,35 +84,35 @@ def order(state: State) -> Order:
     return Order(*np.array(turns, np.int64).reshape(-1, 3).T.copy())
 
 
-def claim(
+def request(
     zones: Zones, state: State, row: Ints, s: Floats, length: Floats, present: Bools, reach: Floats,
     clearance: float = 0.0, entering: Bools | None = None,
 ) -> tuple[State, Held, list[Decision]]:  # fmt: skip
-    """Claims of all trains at one instant.
+    """Requests of all trains at one instant.
 
     Parameters
     ----------
     zones : Zones
         From ``zones``, of the ways the trains have now.
     state : State
-        Claims so far; left as it is.
+        Requests so far; left as it is.
     row, s, length, present : ndarray, shape (n,)
         As in ``along.places``.
     reach : ndarray, shape (n,)
-        How far ahead each train claims [m]: at least its braking distance.
+        How far ahead each train requests [m]: at least its braking distance.
     clearance : float
         Room one standing train needs beyond its length [m].
     entering : ndarray, shape (n,), optional
-        Trains that are not on the net yet and ask to be, at ``row`` and ``s``: they claim, and may enter once their room is not 0.
+        Trains that are not on the net yet and ask to be, at ``row`` and ``s``: they may enter once their room is not 0.
 
     Returns
     -------
     State
-        Claims now.
+        Requests now.
     Held
         How far each train may go.
     list of Decision
-        Claims that were made or granted just now, in order.
+        Requests that were made or granted just now, in order.
 
     Notes
     -----
@@ -265,7 +266,7 @@ def _turns(
 def _queue(
     trains: _Trains, before: Iterable[tuple[int, int, bool]], near: dict[tuple[int, int], int], queues: dict[int, list[int]]
 ) -> tuple[list[tuple[int, int]], dict[tuple[int, int], bool]]:
-    """Claims of stretches in order, and whether they are granted; new ones last, unless they go before another over that edge."""
+    """Requests of stretches in order, and whether they are granted; new ones last, unless they go before another over that edge."""
     granted = {(i, e): bool(g) for i, e, g in before if (i, e) in near}
     order = list(granted)
     over: dict[int, list[int]] = {}  # trains in order, by edge
@@ -283,7 +284,7 @@ def _queue(
 
 
 class _Index:
-    """Which trains claim each edge."""
+    """Which trains request each edge."""
 
     def __init__(self, zones: Zones, trains: _Trains) -> None:
         self.zones, self.trains, self.on = zones, trains, dict[int, list[int]]()
@@ -298,7 +299,7 @@ class _Index:
                     self.on.setdefault(int(ways.edge[r]), []).append(i)
 
     def blocker(self, i: int, rows: Iterable[int]) -> int:
-        """A train that claims the twin of, or what is across, an edge of the stretches of ``i`` at these rows; -1: none."""
+        """A train that requests the twin of, or what is across, an edge of the stretches of ``i`` at these rows; -1: none."""
         net, edge = self.zones.net, self.zones.ways.edge
         for k in rows:
             for r in range(k, self.zones.ends[k] + 1):
@@ -375,7 +376,7 @@ def _stretches(ways: Ways, shared: Bools) -> tuple[Ints, Ints, Ints]:
 
 @njit(cache=True)
 def _near(zones: Zones, row: Ints, s: Floats, length: Floats, on: Bools, until: Floats) -> tuple[Ints, Ints, Bools]:
-    """What every train has to claim, from its rear up to ``until``: train, row, whether it is a join (or a stretch)."""
+    """What every train has to request, from its rear up to ``until``: train, row, whether it is a join (or a stretch)."""
     ways, net, begins = zones.ways, zones.net, zones.begins
     count = 0
     for again in range(2):

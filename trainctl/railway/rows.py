@@ -70,13 +70,13 @@ def tails(
         How far the front is from the start of that edge [m], on the shortest way.
     """
     found = [(0, 0, 0, 0.0) for _ in range(0)]
-    least, sure = np.empty(0), np.empty(0, np.bool_)
+    minimum, sure = np.empty(0), np.empty(0, np.bool_)
     for i in range(len(s)):
         begin = ways.begin[ways.first[i]]
         if not present[i] or begin <= s[i] - length[i]:
             continue
-        if not len(least):
-            least, sure = np.full(len(size), np.inf), np.ones(len(size), np.bool_)
+        if not len(minimum):
+            minimum, sure = np.full(len(size), np.inf), np.ones(len(size), np.bool_)
         to_do, reached, done = [(ways.edge[ways.first[i]], s[i] - begin, True)], [0 for _ in range(0)], 0
         while done < len(to_do):
             e, depth, certain = to_do[done]
@@ -85,15 +85,15 @@ def tails(
             for q in range(before_first[e], before_first[e + 1]):
                 b = before[q]
                 further = depth + size[b]
-                if further < least[b]:
-                    if np.isinf(least[b]):
+                if further < minimum[b]:
+                    if np.isinf(minimum[b]):
                         reached.append(b)
-                    least[b], sure[b] = further, certain and one
+                    minimum[b], sure[b] = further, certain and one
                     if further < length[i]:
                         to_do.append((b, further, sure[b]))
         for b in reached:
-            found.append((i, BEHIND if sure[b] else PERHAPS, b, least[b]))
-            least[b] = np.inf
+            found.append((i, BEHIND if sure[b] else PERHAPS, b, minimum[b]))
+            minimum[b] = np.inf
     train, at, edge = np.empty(len(found), np.int64), np.empty(len(found), np.int64), np.empty(len(found), np.int64)
     depths = np.empty(len(found))
     for q in range(len(found)):

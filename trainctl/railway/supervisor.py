@@ -1,4 +1,4 @@
-"""Protection: the greatest acceleration with which no train can come to reach what it must not reach, a function of data.
+"""Protection: the maximum acceleration with which no train can come to reach what it must not reach, a function of data.
 
 Whoever drives, ``verdict`` bounds each train's acceleration over the coming step and ``applied`` enforces the bounds. Trains move
 in steps: ``v' = max(0, v + a T)``, ``x' = x + ((1 - theta) v + theta v') T``, 0 <= theta < 1; theta is 0 for point trains (they
@@ -19,8 +19,8 @@ no margin touched: before a fixed point ``d >= D(v)``, behind a moving train ``d
 ``d >= D(v) + D(w)``.
 
 1. Full braking for one step takes ``D(v) - D(v')``, so a safe state stays safe under it, and there always is a safe choice.
-   ``verdict`` takes the greatest v' that is safe after the step for the least the others can do: the train ahead brakes with b,
-   it cannot brake harder (``least``); of two opposing trains each takes half of ``d - D(v) - D(w)`` for itself at most.
+   ``verdict`` takes the maximum v' that is safe after the step for the minimum the others can do: the train ahead brakes with b,
+   it cannot brake harder (``minimum``); of two opposing trains each takes half of ``d - D(v) - D(w)`` for itself at most.
    Whatever more the train ahead does only adds, because its way and D(w') grow with w'. So a safe state stays safe, whatever
    is demanded.
 2. Nothing is missed on the way to the end. Behind a train ahead with v' >= w', safety says ``d' >= D(v') - D(w') >= 0``. If
@@ -30,7 +30,7 @@ no margin touched: before a fixed point ``d >= D(v)``, behind a moving train ``d
 3. What a train does is not what is ordered. ``Assumed`` says by how much, train by train: it brakes with ``braking`` at least
    and ``hardest`` at most, it gains ``scatter`` more speed than ordered, it advances by ``drift`` faster than its speed says. So D
    is taken at ``v + drift`` with the sure braking, D of the train ahead with the hardest, and ``scatter`` is taken off the
-   greatest acceleration. A train that brakes more weakly than the one ahead comes nearest at the end or now (while the closing
+   maximum acceleration. A train that brakes more weakly than the one ahead comes nearest at the end or now (while the closing
    speed is positive it grows), so 2. holds with ``braking <= hardest``.
 4. An actuator of lag r follows what is ordered late: ``a' = (u - a) / r``. Under full braking the speed ``v + r (a + braking +
    scatter)`` falls just as that of a train without lag, and is never below v, so it takes the place of v before points; before
@@ -89,7 +89,7 @@ class Params(Table):
         0.7, gt=0.0, description="Deceleration [m/s2] planned with before lower speed limits and stops; at most emergency_mps2."
     )
     margin_m: float = Field(20.0, ge=0.0, description="Kept between a front and what it must not reach [m]; stops are reached.")
-    greatest_mps2: float = Field(1.0, gt=0.0, description="Greatest acceleration admitted [m/s2].")
+    greatest_mps2: float = Field(1.0, gt=0.0, description="Maximum acceleration admitted [m/s2].")
     emergency_distance_m: float = Field(
         0.0, ge=0.0, description="Gap to another train [m] below which emergency braking is ordered whatever the speeds."
     )
@@ -139,7 +139,7 @@ class Targets(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Greatest speeds, shape (k,); in any order, any number per train."""
+    """Maximum speeds, shape (k,); in any order, any number per train."""
 
     train: Ints
     distance: Floats  # m, front to where it begins; <= 0: in force
@@ -149,8 +149,8 @@ class Limits(NamedTuple):
 class Verdict(NamedTuple):
     """What every train may do over the coming step, shape (n,)."""
 
-    greatest: Floats  # m/s2, >= least
-    least: Floats  # m/s2, full emergency braking, but not backwards: a step ends at a stand at worst
+    maximum: Floats  # m/s2, >= minimum
+    minimum: Floats  # m/s2, full emergency braking, but not backwards: a step ends at a stand at worst
     emergency: Bools  # full emergency braking is ordered of a moving train
     reason: Ints  # place in KINDS of what binds, -1: nothing does
     target: Ints  # row of what binds, in Limits if the reason is "limit", otherwise in Targets; -1: none
@@ -188,7 +188,7 @@ def stopping_distance(speed: Floats, b: float | Floats, step: float, theta: floa
 
 
 def greatest_speed(room: Floats, b: float | Floats, step: float, theta: float) -> Floats:
-    """Greatest speed [m/s] with ``stopping_distance`` within ``room`` [m]; 0 where there is no room. Shape of ``room``."""
+    """Maximum speed [m/s] with ``stopping_distance`` within ``room`` [m]; 0 where there is no room. Shape of ``room``."""
     s = np.maximum(room, 0.0) / (b * step**2)
     m = np.maximum(np.floor(theta - 0.5 + np.sqrt((theta - 0.5) ** 2 + 2.0 * s)), 0.0)
     f = (s - m * (0.5 * (m + 1.0) - theta)) / (m + 1.0 - theta)
@@ -203,7 +203,7 @@ def curve(room: Floats, target_speed: Floats, b: float) -> Floats:
 
 
 def speed_after(room: Floats, target_speed: Floats, speed: Floats, b: float | Floats, step: float, theta: float) -> Floats:
-    """Greatest v' [m/s] after a step from which braking still ends at ``target_speed`` u, in whole steps, within ``room`` [m].
+    """Maximum v' [m/s] after a step from which braking still ends at ``target_speed`` u, in whole steps, within ``room`` [m].
 
     Reaching u from ``v' = u + e`` in N steps takes ``T (S - theta e) + N u T`` with S the sum of the excesses e, e - b T, ...
     down to 0; with the way of the step itself that is ``T S + (N + theta) u T + (1 - theta) v T``. For given N it is linear in e;
@@ -253,7 +253,7 @@ def verdict(
     b, n = params.emergency_mps2, len(speed)
     relied = as_ordered(b, n) if assumed is None else assumed
     now = np.zeros(n) if acceleration is None else acceleration
-    least = np.where(relied.lag > 0.0, -b, np.maximum(-b, -(speed + relied.drift) / step_s - relied.scatter))
+    minimum = np.where(relied.lag > 0.0, -b, np.maximum(-b, -(speed + relied.drift) / step_s - relied.scatter))
     rates = np.concatenate([
         _before_targets(params, relied, speed, now, targets, step_s, theta),
         _before_limits(params, relied, speed, now, 0.0 if swing is None else swing, limits, step_s, theta),
@@ -266,7 +266,7 @@ def verdict(
     target[train[binds]] = np.where(binds < len(targets.train), binds, binds - len(targets.train))
     reason[train[binds]] = np.concatenate([targets.kind, np.full(len(limits.train), LIMIT)])[binds]
     emergency = (bound <= _RATE - b) & (speed > 0.0)
-    return Verdict(np.maximum(bound, least), least, emergency, reason, target, -b)
+    return Verdict(np.maximum(bound, minimum), minimum, emergency, reason, target, -b)
 
 
 class _Braking(NamedTuple):
@@ -316,7 +316,7 @@ def too_late(
 def _before_targets(
     params: Params, relied: Assumed, speed: Floats, now: Floats, targets: Targets, step: float, theta: float
 ) -> Floats:
-    """Greatest acceleration each target leaves its train [m/s2], shape (k,); -inf: even full braking comes too late."""
+    """Maximum acceleration each target leaves its train [m/s2], shape (k,); -inf: even full braking comes too late."""
     i, stop = targets.train, targets.kind == STOP
     found = _braking(params, relied, speed, now, targets, step, theta)
     v, b = found.speed, relied.braking[i]
@@ -335,7 +335,7 @@ def _before_targets(
 def _before_limits(
     params: Params, relied: Assumed, speed: Floats, now: Floats, swing: Floats | float, limits: Limits, step: float, theta: float
 ) -> Floats:
-    """Greatest acceleration each limit leaves its train [m/s2], shape (k,)."""
+    """Maximum acceleration each limit leaves its train [m/s2], shape (k,)."""
     settled = speed + swing + (relied.lag * np.maximum(now + relied.scatter, 0.0) if relied.lag.any() else 0.0)
     train = limits.train
     v, top = settled[train], settled[train] + (params.greatest_mps2 + relied.scatter[train]) * step
@@ -359,7 +359,7 @@ def _before_limits(
 
 
 def _planned(emergency: Floats, service: Floats, planned: Floats) -> Floats:
-    """Greatest acceleration with the planned braking as far as it goes, beyond it as late as full braking allows."""
+    """Maximum acceleration with the planned braking as far as it goes, beyond it as late as full braking allows."""
     return np.minimum(emergency, np.maximum(service, -planned))
 
 
@@ -376,10 +376,10 @@ def applied(verdict: Verdict, demanded: Floats) -> tuple[Floats, Bools]:
     Returns
     -------
     acceleration : ndarray, shape (n,)
-        Within ``least`` and ``greatest`` [m/s2].
+        Within ``minimum`` and ``maximum`` [m/s2].
     intervened : ndarray of bool, shape (n,)
         Where that changes the motion. A brake demanded that would outlast the stand is cut at it, which is no intervention.
     """
     wanted = np.where(np.isnan(demanded), -np.inf, demanded)
-    intervened = (wanted > verdict.greatest + _RATE) | (wanted < verdict.strongest - _RATE) & (verdict.least <= verdict.strongest)
-    return np.clip(wanted, verdict.least, verdict.greatest), intervened | np.isnan(demanded)
+    intervened = (wanted > verdict.maximum + _RATE) | (wanted < verdict.strongest - _RATE) & (verdict.minimum <= verdict.strongest)
+    return np.clip(wanted, verdict.minimum, verdict.maximum), intervened | np.isnan(demanded)

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from trainctl.errors import InputError, SimulatorError
 from trainctl.railway.ways import Ways
 from trainctl.record.folder import FORMAT, installed
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import Floats, Ints, Links, Seen, Start
 from trainctl.world import World
 
@@ -238,7 +238,7 @@ def replace(path: Path, content: bytes) -> None:
         os.close(at)
 
 
-def read(folder: Path, p: Prepared) -> Saved | None:
+def read(folder: Path, p: Model) -> Saved | None:
     """The checkpoint in ``folder``, None if none was reached.
 
     Raises
@@ -266,7 +266,7 @@ def read(folder: Path, p: Prepared) -> Saved | None:
     return Saved(values, arrays)
 
 
-def identity(p: Prepared) -> dict[str, Any]:
+def identity(p: Model) -> dict[str, Any]:
     """What a checkpoint and whoever resumes it must agree on, to the last bit of every number."""
     line = hashlib.sha256()
     for part in (p.line.start_m, p.line.length_m, p.line.gradient.breaks, p.line.gradient.slope):
@@ -283,7 +283,7 @@ def identity(p: Prepared) -> dict[str, Any]:
     }
 
 
-def sources(p: Prepared) -> str:
+def sources(p: Model) -> str:
     """Digest of the law's file and of all code of ours that a run's numbers depend on."""
     here, digest = Path(__file__).parent.parent, hashlib.sha256()
     own = (path for path in here.rglob("*.py") if path.relative_to(here).parts[0] not in LOOKS_ON)

@@ -64,7 +64,7 @@ def held(folder: Path) -> Iterator[None]:
         os.close(at)
 
 
-def claim(folder: Path | str, force: bool = False) -> Path:
+def open_partial(folder: Path | str, force: bool = False) -> Path:
     """Make an empty ``DIR.partial`` and return it, or refuse.
 
     Parameters

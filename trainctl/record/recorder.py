@@ -3,7 +3,7 @@
 In short::
 
     info = about_run(scenario_text, seed, sys.argv)
-    partial = claim(out)                                     # DIR.partial, or InputError
+    partial = open_partial(out)                                     # DIR.partial, or InputError
     write_info(partial, info)
     with Recorder(partial, standard_tables(trains, tracks, edges)) as recorder:
         recorder.write("trains", time_s=t, train=codes, position_m=x, ...)   # every step
@@ -289,7 +289,7 @@ class _Stream:
             compression="zstd",
             use_dictionary=[name for name in columns if name not in floats],
             column_encoding=dict.fromkeys(floats, "BYTE_STREAM_SPLIT"),
-            write_statistics=floats,  # least and greatest of names took a third of the writing
+            write_statistics=floats,  # minimum and maximum of names took a third of the writing
         )
 
     def append(self, values: Mapping[str, ArrayLike]) -> None:

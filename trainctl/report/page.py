@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from trainctl.errors import InputError
-from trainctl.figures.trains import Drawn, prepare
+from trainctl.figures.trains import Drawn, drawable
 from trainctl.metrics.run import DEFINITIONS, SLACK, metrics
 from trainctl.record.folder import plain
 from trainctl.report.animation import animation
@@ -74,7 +74,7 @@ def page(run: Run) -> str:
     """The whole page as text."""
     from plotly.offline import get_plotlyjs
 
-    drawn = prepare(run)
+    drawn = drawable(run)
     if not drawn.trains.names:
         raise InputError(f"{run.folder}: no train was recorded")
     values = run.metrics if (run.folder / "metrics.json").exists() else metrics(run)
@@ -139,7 +139,7 @@ def _about(drawn: Drawn) -> str:
 
 
 def _margins(values: Mapping[str, Any]) -> list[tuple[str, str, float, str]]:
-    """Of every kind of bound: words, unit, least margin, whose it is."""
+    """Of every kind of bound: words, unit, minimum margin, whose it is."""
     found = []
     for name, (words, unit) in BOUNDS.items():
         key = f"bounds.{name}"
@@ -170,18 +170,18 @@ def _not_followed(run: Run) -> str:
 def _verdict(values: Mapping[str, Any], run: Run) -> str:
     """All bounds held, or which broke first, where and when."""
     margins = _margins(values)
-    broken = [words for words, _, margin, _ in margins if margin < -SLACK]
+    violated = [words for words, _, margin, _ in margins if margin < -SLACK]
     if not margins:
         return '<p class="verdict"><strong>No bounds</strong> are stated in this scenario.</p>'
-    if not broken and run.info.get("checks_failed"):
-        return f'<p class="verdict">None of {len(margins)} kinds of bound was broken at a recorded instant.</p>'
-    if not broken:
+    if not violated and run.info.get("checks_failed"):
+        return f'<p class="verdict">None of {len(margins)} kinds of bound was violated at a recorded instant.</p>'
+    if not violated:
         return f'<p class="verdict held"><strong>All bounds held</strong> ({len(margins)} kinds, at every recorded instant).</p>'
     first = ""
     if isinstance(values.get("bounds.first_violation_s"), int | float):
         who = escape(str(values.get("bounds.first_violation_who", "")))
         first = f" First at {values['bounds.first_violation_s']:g} s: {who}."
-    return f'<p class="verdict broken"><strong>{len(broken)} of {len(margins)} kinds of bound broken.</strong>{first}</p>'
+    return f'<p class="verdict broken"><strong>{len(violated)} of {len(margins)} kinds of bound violated.</strong>{first}</p>'
 
 
 def _bounds(values: Mapping[str, Any]) -> str:
@@ -191,7 +191,7 @@ def _bounds(values: Mapping[str, Any]) -> str:
         shown = "0" if abs(margin) <= SLACK else f"{margin:.6g}"
         rows.append(
             f"<tr><th scope=row>{words}</th><td class=n>{shown}</td><td>{unit}</td><td>{escape(whose)}</td>"
-            f'<td class="{"held" if held else "broken"}">{"held" if held else "broken"}</td></tr>'
+            f'<td class="{"held" if held else "broken"}">{"held" if held else "violated"}</td></tr>'
         )
     return "".join(rows)
 

@@ -16,9 +16,8 @@ from trainctl.figures import style
 from trainctl.figures.trains import Drawn, in_formation
 from trainctl.metrics.driving import JOULES_PER_KWH
 from trainctl.metrics.values import at_least, at_most
-from trainctl.runs.known import leader
 from trainctl.runs.series import INSTANT
-from trainctl.signals import Bools, Floats
+from trainctl.signals import Bools, Floats, leader_over
 
 Panel = dict[str, Any]
 Trace = dict[str, Any]
@@ -51,9 +50,9 @@ def panel(name: str, title: str, unit: str, traces: list[Trace], **more: Any) ->
 
 
 def _line(x: Floats, y: Floats, name: str, colour: str, lines: int, **look: Any) -> Trace:
-    most, least = POINTS
+    most, minimum = POINTS
     x, y = style.envelope(
-        *style.broken(np.asarray(x, float), np.asarray(y, float)), int(np.clip(POINTS_PER_PANEL // lines, least, most))
+        *style.broken(np.asarray(x, float), np.asarray(y, float)), int(np.clip(POINTS_PER_PANEL // lines, minimum, most))
     )
     return {"x": packed(x), "y": packed(y), "name": name, "color": colour, **look}
 
@@ -95,7 +94,7 @@ def _train_graph(drawn: Drawn) -> Iterator[Panel]:
         for train, rows in drawn.trains.slices():
             value = position[rows] / 1000
             if name == "relative" and reference is not None:
-                value = value - leader(reference, time[rows])[0] / 1000
+                value = value - leader_over(reference, time[rows])[0] / 1000
             for k, place in enumerate(lateral):
                 here = on[rows] == place
                 if not here.any():
@@ -107,7 +106,7 @@ def _train_graph(drawn: Drawn) -> Iterator[Panel]:
                     len(drawn.trains.names), dash=DASHES[k % len(DASHES)], group=train,
                 ))  # fmt: skip
         if reference is not None and name == "graph":
-            traces.append(_reference(drawn, leader(reference, drawn.instants)[0] / 1000))
+            traces.append(_reference(drawn, leader_over(reference, drawn.instants)[0] / 1000))
         yield panel(name, title, unit, traces, note="One colour per train, one dash per track." if name == "graph" else "")
 
 
@@ -134,7 +133,7 @@ def _speeds(drawn: Drawn) -> Panel:
     speed = drawn.trains.column("speed_mps")
     traces = list(_in_and_out(drawn, speed)) if drawn.known.traffic else _of_trains(drawn, speed)
     if drawn.known.reference is not None:
-        traces.append(_reference(drawn, leader(drawn.known.reference, drawn.instants)[1]))
+        traces.append(_reference(drawn, leader_over(drawn.known.reference, drawn.instants)[1]))
     bounds = _limits(value for pair in drawn.known.speed_mps.values() for value in pair)
     if drawn.known.cruise_mps is not None:
         bounds.append({"value": drawn.known.cruise_mps, "name": "cruising speed", "dash": "dot"})
@@ -197,14 +196,14 @@ def _errors(drawn: Drawn) -> Iterator[Panel]:
         _line(time[rows], error[rows], f"link {name}", _hex(colours[k]), len(links.names), group=name)
         for k, (name, rows) in enumerate(links.slices())
     ]
-    least = max(1e-6, float(error.min()))
-    high = max(10.0 * least, float(error.max()))
+    minimum = max(1e-6, float(error.min()))
+    high = max(10.0 * minimum, float(error.max()))
     yield panel(
         "errors",
         "Distance from the desired spacing",
         "|error| [m]",
         traces,
-        log=[float(np.log10(least)), float(np.log10(2 * high))],
+        log=[float(np.log10(minimum)), float(np.log10(2 * high))],
     )
 
 
@@ -216,7 +215,7 @@ def _unit_forces(drawn: Drawn) -> Iterator[Panel]:
     limits |= {-limit for row in drawn.known.braking_n.values() for limit in row}
     traces = _of_units(drawn, drawn.units.column("force_n") / 1000, low / 1000, high / 1000, "unit")
     bounds = _limits(limit / 1000 for limit in limits)
-    note = "Shaded: least and greatest of all units of a train over the sub-steps since the last row."
+    note = "Shaded: minimum and maximum of all units of a train over the sub-steps since the last row."
     yield panel("forces", "Unit forces against limits", "unit force [kN]", traces, bounds=bounds, note=note)
 
 
@@ -244,20 +243,20 @@ def _of_units(drawn: Drawn, value: Floats, low: Floats, high: Floats, what: str)
             traces.append(_line(time[rows], value[rows], f"{what} {name}", _colour(drawn, train), lines, group=train, alpha=alpha))
     for train, parts in of_train.items():
         at = np.unique(np.round(np.concatenate([time[rows] for rows in parts]) / INSTANT)) * INSTANT
-        least, greatest = np.full(len(at), np.inf), np.full(len(at), -np.inf)
+        minimum, maximum = np.full(len(at), np.inf), np.full(len(at), -np.inf)
         for rows in parts:
             k = np.clip(np.searchsorted(at, time[rows] - INSTANT / 2), 0, len(at) - 1)
-            least[k], greatest[k] = np.fmin(least[k], low[rows]), np.fmax(greatest[k], high[rows])
-        some = np.isfinite(least) & np.isfinite(greatest)
-        at, least, greatest = at[some], least[some], greatest[some]
+            minimum[k], maximum[k] = np.fmin(minimum[k], low[rows]), np.fmax(maximum[k], high[rows])
+        some = np.isfinite(minimum) & np.isfinite(maximum)
+        at, minimum, maximum = at[some], minimum[some], maximum[some]
         if not len(at):
             continue
         stretch = -(-len(at) // 500)
         starts = np.arange(0, len(at), stretch)
-        least, greatest = np.minimum.reduceat(least, starts), np.maximum.reduceat(greatest, starts)
+        minimum, maximum = np.minimum.reduceat(minimum, starts), np.maximum.reduceat(maximum, starts)
         band = {"color": _colour(drawn, train), "group": train, "band": True, "x": packed(at[starts])}
-        bands += [{**band, "y": packed(least), "name": f"least, train {train}"}]
-        bands += [{**band, "y": packed(greatest), "name": f"greatest, train {train}", "fill": True}]
+        bands += [{**band, "y": packed(minimum), "name": f"minimum, train {train}"}]
+        bands += [{**band, "y": packed(maximum), "name": f"maximum, train {train}", "fill": True}]
     return bands + traces
 
 

@@ -18,7 +18,7 @@ from trainctl.errors import InputError
 from trainctl.laws import find_law, find_observer, find_plant
 from trainctl.scenario import limits, placing, promise, roster
 from trainctl.scenario.fit import can_brake, connected, fits
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.scenario.plan import initial, plan_of
 from trainctl.scenario.reading import examine, mistakes, read
 from trainctl.scenario.reference import Profile
@@ -30,7 +30,7 @@ from trainctl.signals import (
 from trainctl.topology import graph
 
 
-def open_scenario(name: str, overrides: dict[str, Any] | None = None) -> Prepared:
+def open_scenario(name: str, overrides: dict[str, Any] | None = None) -> Model:
     """Read, check and prepare a scenario by name or path.
 
     Raises
@@ -42,12 +42,12 @@ def open_scenario(name: str, overrides: dict[str, Any] | None = None) -> Prepare
     scenario, found = examine(data)
     if scenario is None:
         raise InputError([f"{path.name}: {line}" for line in found])
-    return prepare(scenario, path.name, path.parent, found)
+    return model_of(scenario, path.name, path.parent, found)
 
 
-def prepare(
+def model_of(
     scenario: Scenario, file: str, folder: Path, known: Sequence[str] = (), enrolled: tuple[roster.Roster, Path] | None = None
-) -> Prepared:
+) -> Model:
     """Everything the loop needs, checked.
 
     Parameters
@@ -115,44 +115,44 @@ def prepare(
         scenario = scenario.model_copy(update={"reference": followed or Profile(speed_mps=scenario.train[front].speed_mps)})
     reference = scenario.reference.leader(start)
     first = graph.links(plan, graph.order_on_tracks(own[consists.first[:-1], POSITION], track), track)
-    prepared = Prepared(
+    model = Model(
         scenario=limits.resolved(scenario, bounds), file=file, law=law, params=params, plant=plant, plant_params=plant_params,
         observer=observer, observer_params=observer_params, consists=consists, own=own, bounds=bounds, reference=reference,
         plan=plan, first_links=first, line=None, spec=None, net=None, roster=None,
     )  # fmt: skip
-    unfit = fits(prepared)
+    unfit = fits(model)
     found += unfit or [
-        *connected(prepared),
-        *law.violations(params, prepared.first_scene),
-        *observer.violations(observer_params, prepared.first_scene),
+        *connected(model),
+        *law.violations(params, model.first_scene),
+        *observer.violations(observer_params, model.first_scene),
     ]  # fmt: skip
     if network is not None:
-        prepared = replace(prepared, line=network[0], spec=network[1], net=network[2])
+        model = replace(model, line=network[0], spec=network[1], net=network[2])
         slopes = np.column_stack([network[0].gradient.breaks, network[0].gradient.slope])
         if slopes[:, 1].any():  # actuators hold their trains where they start
-            prepared = replace(prepared, own=plant.balanced(own, consists, slopes))
+            model = replace(model, own=plant.balanced(own, consists, slopes))
         if trains is not None:
             n = len(scenario.train)
             nobody = graph.links(plan, np.arange(n), np.arange(n))  # everybody alone
             start = initial(scenario, plant, consists)
-            prepared = replace(prepared, own=start, first_links=nobody, roster=trains)
+            model = replace(model, own=start, first_links=nobody, roster=trains)
         elif law.CLOCK != "none":  # such trains leave at the line's end
-            found += placing.long_enough(prepared)
-        found += placing.steep(prepared)
+            found += placing.long_enough(model)
+        found += placing.steep(model)
         if trains is None and not misplaced:
-            prepared = replace(prepared, roster=roster.placed(scenario, network[0]))
-        if prepared.roster is not None and not unfit:  # else there are no numbers to rely on
-            found += can_brake(prepared) or promise.refusals(prepared)
+            model = replace(model, roster=roster.placed(scenario, network[0]))
+        if model.roster is not None:
+            found += can_brake(model) or promise.refusals(model)
     if found:
         # What follows from a key that is wrong already is not a mistake of its own.
         wrong = [line.partition(" = ")[0].partition(":")[0].rpartition(".")[2] for line in known]
         news = [line for line in found[len(known) :] if not any(f"{key} = " in line for key in wrong)]
         raise InputError([f"{file}: {line}" for line in dict.fromkeys([*known, *news])])
-    if prepared.scenario.supervisor is None and trains is None:
-        return prepared
+    if model.scenario.supervisor is None and trains is None:
+        return model
     # What it came to is logged, so that a run can go on from its log.
-    stated = prepared.scenario.model_copy(update={"supervisor": prepared.supervision})
-    return replace(prepared, scenario=stated)
+    stated = model.scenario.model_copy(update={"supervisor": model.supervision})
+    return replace(model, scenario=stated)
 
 
 def _params(model: Any, keys: dict[str, Any], table: str) -> Any:

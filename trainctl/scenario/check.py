@@ -9,14 +9,14 @@ import numpy as np
 
 from trainctl.plants import shared
 from trainctl.scenario import limits, promise
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.topology import graph
 
 #: More trains than this are counted, not named.
 MOST = 40
 
 
-def facts(p: Prepared) -> dict[str, Any]:
+def facts(p: Model) -> dict[str, Any]:
     """Facts by name, ``warnings`` and the law's ``report`` (both lists of lines)."""
     run, scene = p.scenario.run, p.first_scene
     links = graph.edges(scene.links, p.scenario.ids)
@@ -44,8 +44,8 @@ def facts(p: Prepared) -> dict[str, Any]:
             and np.all(np.isfinite(p.bounds.speed_lower) & np.isfinite(p.bounds.speed_upper))
         ):
             speed = np.full(len(p.scenario.ids), p.leader(0.0)[1])
-            least = shared.smallest_period(p.consists, speed, p.bounds.speed_lower, p.bounds.speed_upper)
-            found["smallest_control_period_s"] = round(float(np.max(least)), 6)
+            minimum = shared.smallest_period(p.consists, speed, p.bounds.speed_lower, p.bounds.speed_upper)
+            found["smallest_control_period_s"] = round(float(np.max(minimum)), 6)
             found["input_room_mps2"] = [round(float(p.bounds.input_lower.max()), 6), round(float(p.bounds.input_upper.min()), 6)]
     else:
         found["sub_step_s"] = scene.sub_step
@@ -60,7 +60,7 @@ def facts(p: Prepared) -> dict[str, Any]:
     return found
 
 
-def _traffic(p: Prepared) -> dict[str, Any]:
+def _traffic(p: Model) -> dict[str, Any]:
     """Facts of trains that come and go, and of their net."""
     rails, roster, rules = p.roster.rails, p.roster, p.supervision
     normal = ~rails.internal

@@ -7,25 +7,25 @@ import numpy as np
 from trainctl.laws import unfit
 from trainctl.plants import disturbance
 from trainctl.scenario.limits import room
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.topology import graph
 
 
-def can_brake(p: Prepared) -> list[str]:
+def can_brake(p: Model) -> list[str]:
     """Whether every train can do what the supervisor relies on."""
     rules = p.supervision
     short = np.flatnonzero(p.sure_braking < rules.emergency_mps2 - 1e-9) if rules.mode != "off" else np.zeros(0, np.int64)
     if not len(short):
         return []
     i = int(short[np.argmin(p.sure_braking[short])])
-    least, among = p.sure_braking[i], f" (and {len(short) - 1} other trains too little)" if len(short) > 1 else ""
+    minimum, among = p.sure_braking[i], f" (and {len(short) - 1} other trains too little)" if len(short) > 1 else ""
     return [
-        f"supervisor.emergency_mps2 = {rules.emergency_mps2:g}: train {p.scenario.ids[i]} can brake with {least:.6g} m/s2 at"
+        f"supervisor.emergency_mps2 = {rules.emergency_mps2:g}: train {p.scenario.ids[i]} can brake with {minimum:.6g} m/s2 at"
         f" most{among}"
     ]
 
 
-def fits(p: Prepared) -> list[str]:
+def fits(p: Model) -> list[str]:
     """Law, plant and observer that do not go together, bounds no train can keep, a line that is too short."""
     found = (
         [] if p.law.CLOCK == "none" else unfit(p.law, p.scenario.controller.law, p.scenario.plant.kind, p.scenario.observer.kind)
@@ -41,22 +41,22 @@ def fits(p: Prepared) -> list[str]:
         return found + list(p.law.unfit(p.scenario))
     found += [*_messages_fit(p), *_disturbances_fit(p)]
     if p.sampled:
-        least, greatest = room(p.scenario.bounds_of_trains(), p.plant, p.consists)
+        minimum, maximum = room(p.scenario.bounds_of_trains(), p.plant, p.consists)
         for i, t in enumerate(p.scenario.train):
-            if p.bounds.input_lower[i] < least[i] - 1e-12:
+            if p.bounds.input_lower[i] < minimum[i] - 1e-12:
                 found.append(
                     f"train[{t.id}].input_lower_mps2 = {p.bounds.input_lower[i]:g}: its units can brake with"
-                    f" {-least[i]:.6g} m/s2 at most"
+                    f" {-minimum[i]:.6g} m/s2 at most"
                 )
-            if p.bounds.input_upper[i] > greatest[i] + 1e-12:
+            if p.bounds.input_upper[i] > maximum[i] + 1e-12:
                 found.append(
                     f"train[{t.id}].input_upper_mps2 = {p.bounds.input_upper[i]:g}: its units can give"
-                    f" {greatest[i]:.6g} m/s2 at most in the speed band"
+                    f" {maximum[i]:.6g} m/s2 at most in the speed band"
                 )
     return found
 
 
-def _messages_fit(p: Prepared) -> list[str]:
+def _messages_fit(p: Model) -> list[str]:
     """Exchange periods, loss and delay against the law's clock."""
     run, top = p.scenario.run, p.scenario.topology
     period = top.communication_period_s
@@ -81,7 +81,7 @@ def _messages_fit(p: Prepared) -> list[str]:
     return []
 
 
-def _disturbances_fit(p: Prepared) -> list[str]:
+def _disturbances_fit(p: Model) -> list[str]:
     """Disturbances this law and plant cannot take, and what is wrong in themselves, or in the plant."""
     scenario = p.scenario
     found = disturbance.violations(scenario.disturbance, scenario.ids, scenario.run.seed, hasattr(p.law, "worst"))
@@ -94,7 +94,7 @@ def _disturbances_fit(p: Prepared) -> list[str]:
     return found
 
 
-def connected(p: Prepared) -> list[str]:
+def connected(p: Model) -> list[str]:
     """Assumption of every law: the graph of a formation is connected. Trains alone on a track are formations of their own."""
     links = p.first_scene.links
     groups = graph.components(len(p.scenario.train), links.sender, links.receiver)

@@ -36,10 +36,10 @@ def of_trains(scenario: Scenario, plant: Plant, params: Any, consists: Consists)
         if clamp is not None:
             rows[k] = _tighter(key)(rows[k], clamp)
     bounds = Bounds(*rows)
-    least, greatest = room(bounds, plant, consists)
+    minimum, maximum = room(bounds, plant, consists)
     return bounds._replace(
-        input_lower=np.where(np.isfinite(bounds.input_lower), bounds.input_lower, least),
-        input_upper=np.where(np.isfinite(bounds.input_upper), bounds.input_upper, greatest),
+        input_lower=np.where(np.isfinite(bounds.input_lower), bounds.input_lower, minimum),
+        input_upper=np.where(np.isfinite(bounds.input_upper), bounds.input_upper, maximum),
     )
 
 

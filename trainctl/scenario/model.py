@@ -17,7 +17,7 @@ from trainctl.plants import disturbance
 from trainctl.railway import supervisor
 from trainctl.railway.authority import DRIVER_MARGIN_M
 from trainctl.scenario import limits, promise
-from trainctl.scenario.tables import Scenario, Traffic
+from trainctl.scenario.tables import Scenario, TrafficTable
 from trainctl.signals import (
     POSITION,
     SPEED,
@@ -38,7 +38,7 @@ from trainctl.topology.exchange import Radio
 
 
 @dataclass(frozen=True)
-class Prepared:
+class Model:
     """A scenario as arrays, and the modules it names. ``spec`` is the line's description, or None if it came as a net."""
 
     scenario: Scenario
@@ -75,7 +75,7 @@ class Prepared:
     def supervision(self) -> supervisor.Params:
         """How trains are protected: as the scenario says, else only where they come and go.
 
-        Where the scenario states no emergency braking, and no greatest acceleration, they are the supervisor's usual ones, or more
+        Where the scenario states no emergency braking, and no maximum acceleration, they are the supervisor's usual ones, or more
         if the bounds of the inputs allow the law more: it must not act on what the law may do. No braking is relied on that some
         train cannot give.
         """
@@ -122,7 +122,7 @@ class Prepared:
         return promise.assume(self)
 
     @property
-    def heads(self) -> Ints:
+    def leading(self) -> Ints:
         """Rows of the head units in per-unit arrays, shape (n,)."""
         return self.consists.first[:-1]
 
@@ -152,9 +152,9 @@ class Prepared:
         return self.plant.lead(1)
 
     @cached_property
-    def driving(self) -> Traffic:
+    def driving(self) -> TrafficTable:
         """How trains that come and go are driven."""
-        return self.scenario.traffic or Traffic()
+        return self.scenario.traffic or TrafficTable()
 
     @cached_property
     def driver_rules(self) -> supervisor.Params:
@@ -211,7 +211,7 @@ class Prepared:
 
     @cached_property
     def band(self) -> tuple[float, float]:
-        """Least and greatest speed of a convoy's reference that the law takes [m/s]; infinite where there are no convoys."""
+        """Minimum and maximum speed of a convoy's reference that the law takes [m/s]; infinite where there are no convoys."""
         return speed_band(self) if not self.placed and self.roster.cooperates.sum() > 1 else (-math.inf, math.inf)
 
     @property
@@ -255,8 +255,8 @@ class Prepared:
 BAND_MPS = 0.05
 
 
-def speed_band(p: Prepared) -> tuple[float, float]:
-    """Least and greatest speed of a reference with which the law takes one train of each kind as a formation [m/s]."""
+def speed_band(p: Model) -> tuple[float, float]:
+    """Minimum and maximum speed of a reference with which the law takes one train of each kind as a formation [m/s]."""
     spacing = p.spacing
     cruise = float(p.scenario.reference.speed_mps or 0.0)
     kinds = np.unique([t.type for t in p.scenario.train], return_index=True)[1]
@@ -268,7 +268,7 @@ def speed_band(p: Prepared) -> tuple[float, float]:
     slot = convoys.slots(ahead, order, spacing.desired, np.zeros(len(ahead)))
     links = convoys.links(ahead, order, slot, spacing)
     units, own = np.diff(p.consists.first), p.own.copy()
-    own[:, POSITION] += np.repeat(slot - own[p.heads, POSITION], units)
+    own[:, POSITION] += np.repeat(slot - own[p.leading, POSITION], units)
 
     def takes(v: float) -> bool:
         own[:, SPEED] = v

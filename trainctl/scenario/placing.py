@@ -17,7 +17,7 @@ from trainctl.signals import GRAVITY, Consists, Ints
 from trainctl.topology import graph
 
 if TYPE_CHECKING:
-    from trainctl.scenario.model import Prepared
+    from trainctl.scenario.model import Model
 
 
 def places(scenario: Scenario) -> Ints:
@@ -85,7 +85,7 @@ def followed(scenario: Scenario, line: Line | None, plan: graph.Plan, consists: 
         raise InputError(f"reference.follow_line: {error}") from None
 
 
-def steep(p: Prepared) -> list[str]:
+def steep(p: Model) -> list[str]:
     """Slopes that take too much of the input: on the steepest, what is left must do what the law asks of its bounds.
 
     A law that clamps must hold the reference speed there; any other sampled law relies on the room in its whole speed band, and its
@@ -119,7 +119,7 @@ def steep(p: Prepared) -> list[str]:
     return found or _rules_on_slopes(p)
 
 
-def _rules_on_slopes(p: Prepared) -> list[str]:
+def _rules_on_slopes(p: Model) -> list[str]:
     """What the law objects to on the steepest slopes, and not on the level."""
     g, scene = p.line.gradient, p.first_scene
     if p.law.violations(p.params, scene):
@@ -202,7 +202,7 @@ def _reroute(
     return crossover.to_track, max(at_least, crossover.start_m)
 
 
-def long_enough(p: Prepared) -> list[str]:
+def long_enough(p: Model) -> list[str]:
     """Trains that would run off the line's end at the reference speed."""
     end = p.scenario.run.duration_s
     travel = p.leader(end)[0] - p.leader(0.0)[0]

@@ -24,7 +24,7 @@ from trainctl.railway.ways import ways
 from trainctl.signals import GRAVITY, POSITION, SPEED, Floats
 
 if TYPE_CHECKING:
-    from trainctl.scenario.model import Prepared
+    from trainctl.scenario.model import Model
 
 #: What has no bound is counted as this many standard deviations: exceeded once in 5e8 draws.
 DEVIATIONS = 6.0
@@ -40,7 +40,7 @@ class Parts(NamedTuple):
     fall: Floats  # m/s2, of gravity on the steepest descent of its route
     climb: Floats  # m/s2, on the steepest ascent
     given: Floats  # m/s2, what brakes and slope leave of full braking, with all faults
-    pull: Floats  # m/s2, greatest force per mass at its top speed
+    pull: Floats  # m/s2, maximum force per mass at its top speed
     input: Floats  # m/s2, w3, and a bias of faulty actuators
     speed: Floats  # m/s2, w2 / T
     resistance: Floats  # m/s2, e R
@@ -50,9 +50,9 @@ class Parts(NamedTuple):
     lag: Floats  # s
 
 
-def top_speed(p: Prepared) -> Floats:
+def top_speed(p: Model) -> Floats:
     """Highest speed the line allows every train anywhere on its route, or that it starts with [m/s], shape (n,)."""
-    start = p.own[p.heads, SPEED]
+    start = p.own[p.leading, SPEED]
     if p.placed:
         highest: Floats = np.maximum(float(p.line.speed_mps.max()), start)
         return highest
@@ -63,11 +63,11 @@ def top_speed(p: Prepared) -> Floats:
     return found
 
 
-def _slopes(p: Prepared) -> tuple[Floats, Floats]:
+def _slopes(p: Model) -> tuple[Floats, Floats]:
     """Steepest descent and ascent of every train's route, rise / run >= 0, shape (n,)."""
     if p.placed:
         breaks, slope = p.line.gradient.breaks, p.line.gradient.slope
-        rear = p.own[p.heads, POSITION] - p.consists.train_length()
+        rear = p.own[p.leading, POSITION] - p.consists.train_length()
         first = np.maximum(np.searchsorted(breaks, rear, side="right") - 1, 0)
         ahead = [slope[k:] for k in first.tolist()]
     elif p.scenario.event or not p.rails.slope.any():
@@ -78,22 +78,22 @@ def _slopes(p: Prepared) -> tuple[Floats, Floats]:
     return down, up
 
 
-def parts(p: Prepared) -> Parts:
+def parts(p: Model) -> Parts:
     """Numbers behind ``assume``, for every train of a scenario."""
     n, c, run, b = len(p.scenario.ids), p.consists, p.scenario.run, p.supervision.emergency_mps2
     top, (down, up) = top_speed(p), _slopes(p)
-    greatest = np.zeros((len(disturbance.CHANNELS), n))
+    maximum = np.zeros((len(disturbance.CHANNELS), n))
     for entry in p.scenario.disturbance:
-        greatest += entry.greatest(p.scenario.ids, DEVIATIONS)
-    error = greatest[disturbance.RESISTANCE] * resistance(top, c.train_davis())
+        maximum += entry.maximum(p.scenario.ids, DEVIATIONS)
+    error = maximum[disturbance.RESISTANCE] * resistance(top, c.train_davis())
     fall = GRAVITY * down
     sure = p.plant.relied_on(p.plant_params, c, p.scenario.fault, p.scenario.ids, b, top, fall, DEVIATIONS)
     given = np.minimum(sure.braking, -p.clamps.input_lower - fall)
     pull = np.minimum(sure.pull, p.clamps.input_upper)
     return Parts(
-        top=top, fall=fall, climb=GRAVITY * up, given=given, pull=pull, input=greatest[disturbance.INPUT] + sure.bias,
-        speed=greatest[disturbance.SPEED] / run.step_s, resistance=error + sure.late, noise=sure.noise,
-        position=greatest[disturbance.POSITION], measured=greatest[disturbance.MEASUREMENT], lag=sure.lag,
+        top=top, fall=fall, climb=GRAVITY * up, given=given, pull=pull, input=maximum[disturbance.INPUT] + sure.bias,
+        speed=maximum[disturbance.SPEED] / run.step_s, resistance=error + sure.late, noise=sure.noise,
+        position=maximum[disturbance.POSITION], measured=maximum[disturbance.MEASUREMENT], lag=sure.lag,
     )  # fmt: skip
 
 
@@ -102,7 +102,7 @@ def _scatter(found: Parts) -> Floats:
     return found.input + found.speed + found.resistance + found.noise
 
 
-def assume(p: Prepared) -> Assumed:
+def assume(p: Model) -> Assumed:
     """What the supervisor relies on of every train of a scenario; ``refusals`` says where that cannot be met."""
     found, rules, c = parts(p), p.supervision, p.consists
     scatter = _scatter(found)
@@ -133,10 +133,12 @@ def planned(assumed: Assumed, rate: float) -> Assumed:
     return assumed._replace(braking=braking, hardest=ahead, uncertainty=3.0 * assumed.uncertainty)
 
 
-def refusals(p: Prepared) -> list[str]:
+def refusals(p: Model) -> list[str]:
     """What of the promise cannot be kept in a scenario with ``mode = "on"``, with the numbers that would do."""
     if p.supervision.mode != "on" or p.self_driven:
         return []
+    if p.plant.violations(p.plant_params, p.first_scene, p.scenario.fault):
+        return []  # told already; there are no numbers to rely on
     clamp = float(p.clamps.speed_lower.max())
     if clamp > 0.0:
         return [
@@ -146,7 +148,7 @@ def refusals(p: Prepared) -> list[str]:
     return _weak(p) or _lost(p)
 
 
-def _weak(p: Prepared) -> list[str]:
+def _weak(p: Model) -> list[str]:
     """Trains that cannot be relied on to brake."""
     found, assumed, b = parts(p), p.assumed, p.supervision.emergency_mps2
     surely = np.minimum(found.given, b) - assumed.scatter
@@ -172,7 +174,7 @@ def _weak(p: Prepared) -> list[str]:
     return []
 
 
-def _why(p: Prepared, found: Parts, i: int) -> str:
+def _why(p: Model, found: Parts, i: int) -> str:
     """What leaves train ``i`` so little braking."""
     b = p.supervision.emergency_mps2
     told = [f"full braking {b:g} m/s2"]
@@ -196,11 +198,11 @@ _DISTURBED = {
 }
 
 
-def _lost(p: Prepared) -> list[str]:
+def _lost(p: Model) -> list[str]:
     """Starts from which a collision or an overspeed cannot be averted. Trains that come later enter only where it is safe."""
     if not p.placed:
         return []
-    rules, speed, step = p.supervision, p.own[p.heads, SPEED], p.scenario.run.step_s
+    rules, speed, step = p.supervision, p.own[p.leading, SPEED], p.scenario.run.step_s
     laid = ways([[p.line.index[e] for e in route] for route in p.roster.routes], p.line.start_m, p.line.length_m)
     row, n = laid.first[:-1].copy(), len(speed)
     front = laid.begin[row] + p.roster.lane_position
@@ -232,7 +234,7 @@ def _lost(p: Prepared) -> list[str]:
     return found
 
 
-def told(p: Prepared) -> dict[str, Any]:
+def told(p: Model) -> dict[str, Any]:
     """The promise and what it assumes, in numbers: for `check`, run.json and the report."""
     rules, found, assumed = p.supervision, parts(p), p.assumed
     i = int(np.argmin(assumed.braking))
@@ -258,10 +260,10 @@ def told(p: Prepared) -> dict[str, Any]:
     }
 
 
-def _unbounded(p: Prepared) -> bool:
+def _unbounded(p: Model) -> bool:
     """Whether anything random has no bound, so that the promise holds with a probability only."""
     noisy = p.plant.noise_hold(p.plant_params) is not None
-    return noisy or any(not np.isfinite(entry.greatest(p.scenario.ids)).all() for entry in p.scenario.disturbance)
+    return noisy or any(not np.isfinite(entry.maximum(p.scenario.ids)).all() for entry in p.scenario.disturbance)
 
 
 def sentences(said: dict[str, Any]) -> list[str]:
@@ -272,7 +274,7 @@ def sentences(said: dict[str, Any]) -> list[str]:
         "no law causes a collision, passes a held switch or exceeds the line's limits, as long as:"
         if said["mode"] == "on"
         else "monitored only, nothing is prevented; what would be assumed:",
-        f"every train brakes with at least {said['relied_on_mps2']:.4g} m/s2 up to {said['top_speed_mps']:.4g} m/s (least: train"
+        f"every train brakes with at least {said['relied_on_mps2']:.4g} m/s2 up to {said['top_speed_mps']:.4g} m/s (minimum: train"
         f" {said['relied_on_of']}; ordered {said['full_braking_mps2']:.4g}, brakes and slope leave"
         f" {said['brakes_and_slope_leave_mps2']:.4g})",
     ]

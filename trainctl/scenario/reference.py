@@ -102,7 +102,7 @@ def table(points: Sequence[tuple[float, float]], position: float) -> Reference:
 
 
 class Stretch(NamedTuple):
-    """A piece of way on which the greatest speed squared is a straight line."""
+    """A piece of way on which the maximum speed squared is a straight line."""
 
     start: float  # m
     end: float  # m, inf for the last one
@@ -137,7 +137,7 @@ def obeying(
     rates : tuple of float
         Acceleration and deceleration, both positive [m/s2].
     cap : float
-        Greatest speed [m/s].
+        Maximum speed [m/s].
     below : float
         How far to stay below the limits (not the cap) [m/s].
     stop : float, optional
@@ -255,7 +255,7 @@ class Profile(Table):
     """The ``[reference]`` table: exactly one of the five forms, and where the reference starts."""
 
     position_m: float | None = Field(None, description="position of the reference at time 0 [m]; default: the first train's")
-    speed_mps: float | None = Field(None, ge=0.0, description="constant speed; with follow_line the greatest speed [m/s]")
+    speed_mps: float | None = Field(None, ge=0.0, description="constant speed; with follow_line the maximum speed [m/s]")
     speed_by_position: tuple[Pair, ...] | None = Field(
         None, strict=False, min_length=1, description="[[from_m, speed_mps], ...]: steps where the reference passes from_m"
     )

@@ -14,11 +14,10 @@ import numpy as np
 from sumo_net import Line, LineError, Rails
 from sumo_net.layout import Gradient
 from trainctl.errors import InputError
-from trainctl.scenario.tables import Scenario, Train, TrainType
-from trainctl.scenario.tables import Traffic as Driving
+from trainctl.scenario.tables import Scenario, TrafficTable, Train, TrainType
 from trainctl.scenario.train_types import train_type
 from trainctl.signals import Bools, Floats, Ints
-from trainctl.traffic.read import Departure, Traffic, read_traffic
+from trainctl.traffic.read import Configuration, Departure, read_traffic
 
 #: A train that stops at the end of its way stands this far before it [m]; nearer than 0.1 m it would have left.
 STANDS_SHORT_M = 0.2
@@ -133,7 +132,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
     except LineError as error:
         raise InputError([f"network.sumocfg: {m}" for m in error.mistakes]) from None
     types, found = _types(scenario, traffic)
-    driving = scenario.traffic or Driving()
+    driving = scenario.traffic or TrafficTable()
     ids = [d.id for d in traffic.departures]
     together = np.array([any(fnmatch.fnmatchcase(i, p) for p in driving.cooperate) for i in ids], bool)
     found += [
@@ -211,7 +210,7 @@ def _events(scenario: Scenario, ids: list[str], rails: Rails) -> list[str]:
     return found
 
 
-def _types(scenario: Scenario, traffic: Traffic) -> tuple[dict[str, TrainType], list[str]]:
+def _types(scenario: Scenario, traffic: Configuration) -> tuple[dict[str, TrainType], list[str]]:
     """Data of every vType that runs: the scenario's own, else what the vType says of itself."""
     types, found = dict(scenario.train_type), []
     for name in dict.fromkeys(d.kind for d in traffic.departures):

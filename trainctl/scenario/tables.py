@@ -35,7 +35,7 @@ Id = Annotated[str, BeforeValidator(_name, json_schema_input_type=int | str)]
 PerUnit = float | tuple[float, ...]
 
 
-class Run(Table):
+class RunTable(Table):
     """[run]: time."""
 
     duration_s: Positive = Field(description="Length of the run [s].")
@@ -53,7 +53,7 @@ class Run(Table):
     seed: int | None = Field(None, ge=0, description="Seed of everything random; required as soon as something is.")
 
     @model_validator(mode="after")
-    def _multiples(self) -> Run:
+    def _multiples(self) -> RunTable:
         for key in ("duration_s", "control_period_s", "record_every_s"):
             value = getattr(self, key)
             steps = min(value / self.step_s, MOST_STEPS) if value is not None else 0.0
@@ -100,7 +100,7 @@ class Network(Table):
         return self
 
 
-class Traffic(Table):
+class TrafficTable(Table):
     """[traffic]: how trains of a SUMO configuration are driven outside of formations, and when they form one."""
 
     def below(self, limit: Floats) -> Floats:
@@ -126,12 +126,12 @@ class Traffic(Table):
 class BoundsTable(Table):
     """[bounds]: what every train must keep; a [[train]] may state its own."""
 
-    speed_lower_mps: float | None = Field(None, description="Least speed [m/s].")
-    speed_upper_mps: float | None = Field(None, description="Greatest speed [m/s].")
-    input_lower_mps2: float | None = Field(None, description="Least input, applied force per mass [m/s2], negative.")
-    input_upper_mps2: float | None = Field(None, description="Greatest input, applied force per mass [m/s2].")
-    coupler_lower_m: float | None = Field(None, lt=0, description="Least coupler displacement (compression) [m], negative.")
-    coupler_upper_m: float | None = Field(None, gt=0, description="Greatest coupler displacement (stretch) [m].")
+    speed_lower_mps: float | None = Field(None, description="Minimum speed [m/s].")
+    speed_upper_mps: float | None = Field(None, description="Maximum speed [m/s].")
+    input_lower_mps2: float | None = Field(None, description="Minimum input, applied force per mass [m/s2], negative.")
+    input_upper_mps2: float | None = Field(None, description="Maximum input, applied force per mass [m/s2].")
+    coupler_lower_m: float | None = Field(None, lt=0, description="Minimum coupler displacement (compression) [m], negative.")
+    coupler_upper_m: float | None = Field(None, gt=0, description="Maximum coupler displacement (stretch) [m].")
 
 
 class Topology(Table):
@@ -146,8 +146,8 @@ class Topology(Table):
         "equal: neighbours keep spacing_m, the hole closes.",
     )
     spacing_m: Positive | None = Field(None, description="Desired spacing of consecutive trains, front to front [m].")
-    lower_m: float | None = Field(None, description="Least spacing of consecutive trains, front to front [m]; default none.")
-    upper_m: Positive | None = Field(None, description="Greatest spacing of consecutive trains [m]; default none.")
+    lower_m: float | None = Field(None, description="Minimum spacing of consecutive trains, front to front [m]; default none.")
+    upper_m: Positive | None = Field(None, description="Maximum spacing of consecutive trains [m]; default none.")
     weight: float = Field(1.0, description="Weight of links that state none (laws with weighted graphs).")
     first_slot_m: float = Field(0.0, description="Wanted position of the first train relative to the reference [m].")
     range_m: Positive | None = Field(None, description="Messages do not reach farther than this [m]; default unlimited.")
@@ -166,8 +166,8 @@ class Link(Table):
     sender: Id | None = Field(None, description="With receiver, instead of between: a link in one direction.")
     receiver: Id | None = Field(None, description="The train that hears.")
     desired_m: float | None = Field(None, description="Desired x_first - x_second (sender - receiver) [m]; default from the slots.")
-    lower_m: float | None = Field(None, description="Least spacing [m]; default the sum over the consecutive links it spans.")
-    upper_m: float | None = Field(None, description="Greatest spacing [m]; default the sum over the consecutive links it spans.")
+    lower_m: float | None = Field(None, description="Minimum spacing [m]; default the sum over the consecutive links it spans.")
+    upper_m: float | None = Field(None, description="Maximum spacing [m]; default the sum over the consecutive links it spans.")
     weight: float | None = Field(None, description="Weight a_ij of this link.")
     extra: bool = Field(
         False, description="With rule = same_track: exists whenever both trains are on one track, neighbours or not."
@@ -201,10 +201,10 @@ class TrainType(Table):
     c2_ns2_per_m2_kg: PerUnit = Field(description="Davis resistance, square part [N s2/(m2 kg)].")
     coupler_stiffness_n_per_m: PerUnit = Field(0.0, description="Stiffness of the coupler behind each unit but the last [N/m].")
     coupler_damping_ns_per_m: PerUnit = Field(0.0, description="Damping of that coupler [N s/m].")
-    traction_n: PerUnit | None = Field(None, description="Greatest tractive effort [N]; default unlimited.")
-    traction_power_w: PerUnit | None = Field(None, description="Greatest traction power [W]; default unlimited.")
-    braking_n: PerUnit | None = Field(None, description="Greatest braking effort, positive [N]; default unlimited.")
-    braking_power_w: PerUnit | None = Field(None, description="Greatest braking power [W]; default unlimited.")
+    traction_n: PerUnit | None = Field(None, description="Maximum tractive effort [N]; default unlimited.")
+    traction_power_w: PerUnit | None = Field(None, description="Maximum traction power [W]; default unlimited.")
+    braking_n: PerUnit | None = Field(None, description="Maximum braking effort, positive [N]; default unlimited.")
+    braking_power_w: PerUnit | None = Field(None, description="Maximum braking power [W]; default unlimited.")
     actuator_rate_per_s: PerUnit = Field(0.0, description="r of the actuator tau' = -r tau + r demand [1/s] (actuated_units).")
 
     #: Keys whose list may be one shorter than the units: couplers.
@@ -221,15 +221,15 @@ class TrainType(Table):
                 lengths = (self.units, self.units - 1) if key in self._couplers else (self.units,)
                 if len(value) not in lengths:
                     wrong.append(f"{key} has {len(value)} values: units = {self.units} of them are needed (or one number for all)")
-            least = min(np.atleast_1d(value), default=0.0)
-            if key == "unit_mass_kg" and least <= 0:
-                wrong.append(f"{key} = {least:g}: must be above 0")
-            elif key == "rotating_mass_factor" and least < 1:
-                wrong.append(f"{key} = {least:g}: must be at least 1")
-            elif key in ("traction_n", "traction_power_w", "braking_n", "braking_power_w") and least <= 0:
-                wrong.append(f"{key} = {least:g}: must be above 0 (leave it out for no limit)")
-            elif least < 0:
-                wrong.append(f"{key} = {least:g}: must not be negative")
+            minimum = min(np.atleast_1d(value), default=0.0)
+            if key == "unit_mass_kg" and minimum <= 0:
+                wrong.append(f"{key} = {minimum:g}: must be above 0")
+            elif key == "rotating_mass_factor" and minimum < 1:
+                wrong.append(f"{key} = {minimum:g}: must be at least 1")
+            elif key in ("traction_n", "traction_power_w", "braking_n", "braking_power_w") and minimum <= 0:
+                wrong.append(f"{key} = {minimum:g}: must be above 0 (leave it out for no limit)")
+            elif minimum < 0:
+                wrong.append(f"{key} = {minimum:g}: must not be negative")
         if self.units > 1 and min(np.atleast_1d(self.unit_length_m)) <= 0:
             wrong.append("unit_length_m: a train of several units needs lengths above 0")
         if wrong:
@@ -257,16 +257,16 @@ class Train(Table):
     unit_speed_mps: tuple[float, ...] | None = Field(None, description="Speed of each unit [m/s]; default speed_mps.")
     coupler_m: tuple[float, ...] | None = Field(None, description="Displacement of each coupler at the start [m]; default at rest.")
     speed_lower_mps: float | None = Field(
-        None, description="Own least speed; the tighter of this, [bounds] and [plant] acts [m/s]."
+        None, description="Own minimum speed; the tighter of this, [bounds] and [plant] acts [m/s]."
     )
     speed_upper_mps: float | None = Field(
-        None, description="Own greatest speed; the tighter of this, [bounds] and [plant] acts [m/s]."
+        None, description="Own maximum speed; the tighter of this, [bounds] and [plant] acts [m/s]."
     )
     input_lower_mps2: float | None = Field(
-        None, description="Own least input; the tighter of this, [bounds] and [plant] acts [m/s2]."
+        None, description="Own minimum input; the tighter of this, [bounds] and [plant] acts [m/s2]."
     )
     input_upper_mps2: float | None = Field(
-        None, description="Own greatest input; the tighter of this, [bounds] and [plant] acts [m/s2]."
+        None, description="Own maximum input; the tighter of this, [bounds] and [plant] acts [m/s2]."
     )
 
 
@@ -335,7 +335,7 @@ class Scenario(Table):
 
     schema_version: Literal[1] = Field(description="Version of this format.")
     title: str = Field(description="One line: what the run shows.")
-    run: Run
+    run: RunTable
     network: Network
     controller: Controller
     observer: Observer = Observer()
@@ -344,7 +344,7 @@ class Scenario(Table):
     bounds: BoundsTable = BoundsTable()
     topology: Topology = Topology()
     supervisor: Supervisor | None = Field(None, description="Protection; default: off, on with network.sumocfg.")
-    traffic: Traffic | None = Field(None, description="Only with network.sumocfg.")
+    traffic: TrafficTable | None = Field(None, description="Only with network.sumocfg.")
     train_type: dict[str, TrainType] = Field({}, description="With network.sumocfg: by the ids of its vTypes.")
     train: tuple[Train, ...] = ()
     link: tuple[Link, ...] = ()

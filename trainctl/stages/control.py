@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from trainctl.errors import LawError
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import POSITION, SPEED, Demand, Disturbed, Floats, Formed, Messages, Trains
 from trainctl.topology import exchange
 
@@ -16,7 +16,7 @@ from trainctl.topology import exchange
 class Control:
     """Sampled laws; continuous ones are evaluated inside the plant's step."""
 
-    def __init__(self, p: Prepared) -> None:
+    def __init__(self, p: Model) -> None:
         self.p = p
         self.radio = p.radio
         self.clamps = getattr(p.law, "CLAMPED", False) and not p.plant.CLAMPS  # else the plant does
@@ -65,9 +65,9 @@ class Control:
         disturbed: Disturbed,
     ) -> tuple[Demand, Formed, Messages, Any]:  # fmt: skip
         assert formed.links is not None
-        p, law, heads = self.p, self.p.law, own[self.p.heads]
+        p, law, leading = self.p, self.p.law, own[self.p.leading]
         leader = formed.references.leader(t)
-        trains = Trains(heads[:, POSITION] + disturbed.measurement, heads[:, SPEED], resistance)
+        trains = Trains(leading[:, POSITION] + disturbed.measurement, leading[:, SPEED], resistance)
         sent = law.message(formed.constants, trains, leader)
         number = k // p.scenario.run.held_steps
         messages, heard = exchange.deliver(self.radio, messages, sent, trains.position, formed.links, number)
@@ -88,7 +88,7 @@ class Control:
         """Speed and input clamps of a law whose model has them, for trains of units."""
         if not self.clamps:
             return demand
-        bounds, speed, asked = self.p.bounds, own[self.p.heads, SPEED], demand.acceleration
+        bounds, speed, asked = self.p.bounds, own[self.p.leading, SPEED], demand.acceleration
         period = self.p.scenario.run.control_period_s or self.p.scenario.run.step_s
         given = np.clip(asked, bounds.input_lower - resistance, bounds.input_upper - resistance)
         given = np.clip(given, (bounds.speed_lower - speed) / period, (bounds.speed_upper - speed) / period)

@@ -13,7 +13,7 @@ import numpy as np
 from trainctl.railway import along
 from trainctl.railway.authority import View
 from trainctl.railway.supervisor import SWITCH
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import POSITION, SPEED, Bools, Floats, Formed, Ints, Links, Pace, Reference, Seen, restrict
 from trainctl.stages.record import Journal
 from trainctl.stages.traffic import SOON_S, Around
@@ -23,7 +23,7 @@ from trainctl.topology import convoys
 #: A train that waits to couple asks its law again after this [s].
 ASK_AGAIN_S = 2.0
 
-#: A formation dissolves this share of the cruising speed above the least speed its law can hold; to form it needs thrice that.
+#: A formation dissolves this share of the cruising speed above the minimum speed its law can hold; to form it needs thrice that.
 DISSOLVES = 0.02
 
 #: A train that uncoupled does not couple again to the same one within this time [s].
@@ -44,14 +44,14 @@ class Convoys:
 
     CHECKS = False  # the law was asked before trains coupled
 
-    def __init__(self, p: Prepared, journal: Journal) -> None:
+    def __init__(self, p: Model, journal: Journal) -> None:
         self.p, self.journal, self.roster = p, journal, p.roster
         self.n, self.step_s, self.spacing = len(p.scenario.ids), p.scenario.run.step_s, p.spacing
-        self.least = p.band[0]
+        self.minimum = p.band[0]
 
     def initial(self) -> tuple[State, Formed]:
         """Everybody alone, at his own speed."""
-        n, own = self.n, self.p.own[self.p.heads]
+        n, own = self.n, self.p.own[self.p.leading]
         alone = convoys.references(Pace(own[:, POSITION], own[:, SPEED], np.zeros(n)), 0.0)
         formed = Formed(None, np.arange(n), np.full(n, -1), np.zeros(n, bool), np.zeros(n), alone, (), None)
         return State(np.zeros(n), np.zeros(n), np.full(n, -1), np.full(n, -1)), formed
@@ -83,7 +83,7 @@ class Convoys:
         for i in free[self._fits(free, view, own)].tolist():
             self._ask(i, t, view, asks)
         own = asks.own
-        alone, head = ~led(asks.ahead), own[p.heads]
+        alone, head = ~led(asks.ahead), own[p.leading]
         asks.slot[alone] = 0.0
         asks.pace.position[alone], asks.pace.speed[alone] = head[alone, POSITION], head[alone, SPEED]
         asks.pace.acceleration[alone] = 0.0
@@ -120,7 +120,7 @@ class Convoys:
 
     def _fits(self, trains: Ints, view: View, own: Floats) -> Bools:
         """Whether spacing and speeds of these trains (k,) and those ahead of them are right for coupling."""
-        p, d, speed = self.p, self.p.driving, own[self.p.heads, SPEED]
+        p, d, speed = self.p, self.p.driving, own[self.p.leading, SPEED]
         inside = (p.bounds.speed_lower < speed) & (speed < p.bounds.speed_upper)
         ahead, spacing = view.ahead.train[trains], view.ahead.spacing[trains]
         closing = speed[ahead] - speed[trains]
@@ -139,8 +139,8 @@ class Convoys:
         """Couple ``i`` to ``j`` if the law's start condition holds for the longer formation; returns what it objects to."""
         p, front, own = self.p, convoys.fronts(asks.ahead), asks.own
         behind, before = np.flatnonzero(front == front[i]), np.flatnonzero(front == front[j])
-        heads = p.heads
-        shift = own[heads[j], POSITION] - spacing - own[heads[i], POSITION]
+        leading = p.leading
+        shift = own[leading[j], POSITION] - spacing - own[leading[i], POSITION]
         moved = own.copy()
         units = np.repeat(np.isin(np.arange(self.n), behind), np.diff(p.consists.first))
         moved[units, POSITION] += shift
@@ -169,17 +169,17 @@ class Convoys:
         asks.ahead[i] = -1
 
     def _too_slow(self, asks: _Asking) -> Ints:
-        """Coupled trains of formations whose reference nears the least speed the law can hold."""
-        slow = asks.pace.speed < self.least + DISSOLVES * self.p.cruise
+        """Coupled trains of formations whose reference nears the minimum speed the law can hold."""
+        slow = asks.pace.speed < self.minimum + DISSOLVES * self.p.cruise
         return np.flatnonzero((asks.ahead >= 0) & slow[convoys.fronts(asks.ahead)])
 
     def _slows_soon(self, own: Floats, view: View, asks: _Asking) -> Bools:
         """Trains that must soon run slower than a formation can, or whose train ahead must."""
-        speed, lowest = own[self.p.heads, SPEED], np.full(self.n, np.inf)
+        speed, lowest = own[self.p.leading, SPEED], np.full(self.n, np.inf)
         lines = view.limits
         close = lines.distance < SOON_S * np.maximum(speed, 1.0)[lines.train]
         np.minimum.at(lowest, lines.train[close], self.p.driving.below(lines.speed[close]))
-        slows = lowest < self.least + 3.0 * DISSOLVES * self.p.cruise
+        slows = lowest < self.minimum + 3.0 * DISSOLVES * self.p.cruise
         found: Bools = slows | slows[convoys.fronts(asks.ahead)][view.ahead.train]
         return found
 

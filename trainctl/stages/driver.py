@@ -9,7 +9,7 @@ import numpy as np
 from trainctl.railway import authority, supervisor
 from trainctl.railway.authority import View
 from trainctl.railway.supervisor import STOP
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import Bools, Floats, Formed
 from trainctl.stages.traffic import Around
 from trainctl.stages.traffic import State as Traffic
@@ -24,7 +24,7 @@ HELD_MPS = 1e-3
 #: Share of the haste to catch up with another formation that is left while a train behind is nearer to joining this one.
 HASTE = 0.5
 
-#: Share of the room between cruising speed and the greatest speed that haste may use.
+#: Share of the room between cruising speed and the maximum speed that haste may use.
 ROOM_FOR_HASTE = 0.75
 
 
@@ -35,7 +35,7 @@ class Driven(NamedTuple):
     stands: Bools  # (n,) the train is held where it is
 
 
-def of(p: Prepared) -> Nobody | Driver:
+def of(p: Model) -> Nobody | Driver:
     """The driver of a scenario's trains."""
     return Driver(p) if p.driven else Nobody()
 
@@ -53,11 +53,11 @@ class Nobody:
 class Driver:
     """Drives whoever no law does."""
 
-    def __init__(self, p: Prepared) -> None:
+    def __init__(self, p: Model) -> None:
         self.p, self.n = p, len(p.scenario.ids)
         self.step_s, self.theta = p.scenario.run.step_s, p.step_theta
         self.rules, self.assumed = p.driver_rules, p.relied_on_by_driver
-        self.greatest = p.band[1]
+        self.maximum = p.band[1]
 
     def step(
         self, speed: Floats, acceleration: Floats, around: Around, traffic: Traffic, formed: Formed, commanded: Floats
@@ -90,10 +90,10 @@ class Driver:
         v = np.maximum(np.where(led, references.pace.speed, speed), 0.0)
         limits = view.limits._replace(speed=self.p.driving.below(view.limits.speed))
         judged = self.step_s, self.theta, self.assumed, acceleration
-        by_limits = supervisor.verdict(self.rules, v, supervisor.no_targets(), limits, *judged).greatest
+        by_limits = supervisor.verdict(self.rules, v, supervisor.no_targets(), limits, *judged).maximum
         targets = authority.with_targets(authority.of(view.targets, first[view.targets.train]), *around.stops, STOP)
         clear = authority.with_targets(authority.of(view.clear, first[view.clear.train]), *around.stops, STOP)
-        free = authority.judge(self.rules, v, targets, clear, supervisor.no_limits(), *judged).greatest
+        free = authority.judge(self.rules, v, targets, clear, supervisor.no_limits(), *judged).maximum
         lowest = np.full(self.n, np.inf)
         np.minimum.at(lowest, front, np.minimum(by_limits, np.where(first, free, np.inf)))
         wish = (self._wish(v, view, traffic, formed) - v) / self.step_s
@@ -122,6 +122,6 @@ class Driver:
         yields, cruising = behind[near] < error, cruise[near]
         most = np.minimum(cruising + np.where(yields, HASTE, 1.0) * p.driving.catch_up_mps, p.roster.top_speed[near])
         most = np.minimum(most, cruising + np.maximum(ROOM_FOR_HASTE * (p.bounds.speed_upper[near] - cruising), 0.0))
-        most = np.where(yields | formed.led[near], np.minimum(most, self.greatest), most)
+        most = np.where(yields | formed.led[near], np.minimum(most, self.maximum), most)
         wish[near] = np.clip(v[j] + convoys.closing_speed(error), 0.0, most)
         return wish

@@ -10,14 +10,14 @@ from __future__ import annotations
 import numpy as np
 
 from trainctl.plants import point
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import GRAVITY, POWERS, Floats, Motion, Observed
 
 
 class Effort:
     """Masses, resistances and slopes of a scenario."""
 
-    def __init__(self, p: Prepared) -> None:
+    def __init__(self, p: Model) -> None:
         c, self.step_s = p.consists, p.scenario.run.step_s
         self.mass = c.train_mass()
         self.rotating = np.add.reduceat(c.mass * c.rotating, c.first[:-1]) / self.mass  # inertia over mass

@@ -10,7 +10,7 @@ import numpy as np
 
 from trainctl.davis import resistance
 from trainctl.plants import coupled_units, faults, integrate, point, shared
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import (
     FORCE,
     GRAVITY,
@@ -59,12 +59,12 @@ class Moved(NamedTuple):
     state: State
 
 
-def of(p: Prepared) -> Points | Units:
+def of(p: Model) -> Points | Units:
     """The plant of a scenario."""
     return Units(p) if p.plant.UNITS else Points(p)
 
 
-def _slopes(p: Prepared) -> Floats:
+def _slopes(p: Model) -> Floats:
     """Where the line's slopes begin [m] and their rise / run, shape (G, 2); (0, 2) on a level line."""
     slopes = np.column_stack([p.line.gradient.breaks, p.line.gradient.slope])
     return slopes if slopes[:, 1].any() else np.zeros((0, 2))
@@ -73,7 +73,7 @@ def _slopes(p: Prepared) -> Floats:
 class Points:
     """Point trains under a sampled law."""
 
-    def __init__(self, p: Prepared) -> None:
+    def __init__(self, p: Model) -> None:
         self.step_s = p.scenario.run.step_s
         self.noisy = p.plant.noise_hold(p.plant_params) is not None
         self.plant = cast(PointPlant, p.plant)
@@ -132,7 +132,7 @@ class Points:
 class Units:
     """Trains of units, integrated jointly with observer and law; a sampled law's acceleration is shared out to them."""
 
-    def __init__(self, p: Prepared) -> None:
+    def __init__(self, p: Model) -> None:
         self.p = p
         run, top = p.scenario.run, p.scenario.topology
         self.step_s, self.sub_steps = run.step_s, run.sub_steps
@@ -207,12 +207,12 @@ class Units:
         self, k: int, t: float, own: Floats, demand: Demand, ordered: Floats, formed: Formed, messages: Messages, state: State,
         disturbed: Disturbed, calm: bool = False,
     ) -> Moved:  # fmt: skip
-        """Integrate over one simulator step; the displacement is that of the heads. ``calm``: without the plant's noise.
+        """Integrate over one simulator step; the displacement is that of the leading units. ``calm``: without the plant's noise.
 
         Trains with an ``ordered`` (n,) acceleration, not NaN, hold that instead of what their law demands. The arrays of ``state``
         are reused: who tries a step first hands over a ``copied`` one.
         """
-        p, first, heads = self.p, self.p.consists.first, self.p.heads
+        p, first, leading = self.p, self.p.consists.first, self.p.leading
         told = np.where(np.isnan(ordered), demand.acceleration, ordered) if p.sampled else ordered
         for held in (self.told, self.orders.held):
             if len(held.acceleration):
@@ -241,14 +241,14 @@ class Units:
         assert demanded is not None
         extras = self._extras(t, own, estimate, demanded, loop)
         force = own[:, FORCE].copy() if p.plant.STATES > FORCE else demanded
-        displacement = moved[heads, POSITION] - own[heads, POSITION] + disturbed.position
+        displacement = moved[leading, POSITION] - own[leading, POSITION] + disturbed.position
         clipped = displacement < 0.0
         displacement[clipped] = 0.0
-        shift = np.repeat(own[heads, POSITION] + displacement - moved[heads, POSITION], np.diff(first))
+        shift = np.repeat(own[leading, POSITION] + displacement - moved[leading, POSITION], np.diff(first))
         moved[:, POSITION] += shift
-        mean = (moved[heads, SPEED] - own[heads, SPEED]) / self.step_s
+        mean = (moved[leading, SPEED] - own[leading, SPEED]) / self.step_s
         motion = Motion(
-            displacement=displacement, input=np.add.reduceat(force, heads) / self.masses, acceleration=mean,
+            displacement=displacement, input=np.add.reduceat(force, leading) / self.masses, acceleration=mean,
             asked=self._asked(own, moved, displacement, mean), limited=state.extremes.limited > limited, clipped=clipped,
             force=force, extras=extras,
         )  # fmt: skip
@@ -260,8 +260,8 @@ class Units:
         Where actuators lag it is what they approach; else the mean, or the one that explains the displacement where that is more (a
         law pulls first and brakes later within the step) or less than full braking (it brakes first).
         """
-        heads, full = self.p.heads, self.p.supervision.emergency_mps2
-        v, after = own[heads, SPEED], moved[heads, SPEED]
+        leading, full = self.p.leading, self.p.supervision.emergency_mps2
+        v, after = own[leading, SPEED], moved[leading, SPEED]
         drives = mean + (self.swing(moved) - self.swing(own)) / self.step_s
         late = self.p.plant.STATES > FORCE
         if late:
@@ -290,10 +290,10 @@ class Units:
         """Acceleration of every train now, where actuators make it a state [m/s2], (n,)."""
         if self.p.plant.STATES <= FORCE:
             return np.zeros(len(self.masses))
-        c, heads = self.p.consists, self.p.heads
-        force = np.add.reduceat(own[:, FORCE], heads) - self.masses * self.believed_resistance(own)
-        found: Floats = force / np.add.reduceat(c.mass * c.rotating, heads)
-        return np.where(own[heads, SPEED] > 0.0, found, np.maximum(found, 0.0))
+        c, leading = self.p.consists, self.p.leading
+        force = np.add.reduceat(own[:, FORCE], leading) - self.masses * self.believed_resistance(own)
+        found: Floats = force / np.add.reduceat(c.mass * c.rotating, leading)
+        return np.where(own[leading, SPEED] > 0.0, found, np.maximum(found, 0.0))
 
     def swing(self, own: Floats) -> Floats:
         """By how much couplers, and units against each other, may still speed up every head [m/s], (n,): all of their energy."""
@@ -304,7 +304,7 @@ class Units:
         stretch = own[:-1, POSITION] - own[1:, POSITION] - c.length[:-1]
         energy[:-1] += c.stiffness[:-1] * stretch**2  # 0 behind the last unit
         fastest = mean + np.sqrt(np.add.reduceat(energy, c.first[:-1]) / np.minimum.reduceat(c.mass, c.first[:-1]))
-        more: Floats = np.maximum(fastest - v[self.p.heads], 0.0)
+        more: Floats = np.maximum(fastest - v[self.p.leading], 0.0)
         return more
 
     def overrun(self, own: Floats, braking: float) -> Floats:
@@ -315,7 +315,7 @@ class Units:
         if self.p.plant.STATES <= FORCE:
             return np.zeros(len(self.masses))
         late = np.maximum(self.acceleration(own) / braking + 1.0, 0.0)
-        found: Floats = self.lag * np.maximum(own[self.p.heads, SPEED], 0.0) * late
+        found: Floats = self.lag * np.maximum(own[self.p.leading, SPEED], 0.0) * late
         return found
 
     def climbs(self, slope: Floats) -> None:
@@ -351,7 +351,7 @@ class Units:
         first, sent = self.p.consists.first, state.work.sent
         live = air._replace(live=True) if first_time else air
         integrate.exchange(self.parts, loop, first, links, references, live, t, own, state.estimate, state.work)
-        messages, _ = exchange.deliver(self.radio, messages, sent.copy(), own[self.p.heads, POSITION], links, number)
+        messages, _ = exchange.deliver(self.radio, messages, sent.copy(), own[self.p.leading, POSITION], links, number)
         fresh = ~messages.ever
         messages.heard[fresh] = sent[links.sender[fresh]]
         return messages, air._replace(heard=messages.heard.copy(), sent_at=t)

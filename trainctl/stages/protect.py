@@ -10,7 +10,7 @@ import numpy as np
 from trainctl.railway import authority, supervisor
 from trainctl.railway.authority import View
 from trainctl.railway.supervisor import KINDS, applied
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import SPEED, Bools, Disturbed, Floats
 from trainctl.stages import plant
 from trainctl.stages.driver import Driven
@@ -23,7 +23,7 @@ OverTheStep = Callable[[Floats, Disturbed, plant.State, bool], plant.Moved]
 class Protect:
     """The supervisor of a run: bounds accelerations, and tells when it begins and ends to do so."""
 
-    def __init__(self, p: Prepared, journal: Journal, disturbing: bool) -> None:
+    def __init__(self, p: Model, journal: Journal, disturbing: bool) -> None:
         self.p, self.rules, self.journal = p, p.supervision, journal
         self.disturbing = disturbing
 
@@ -59,7 +59,7 @@ class Protect:
         """
         if view is None or self.rules.mode == "off":
             return over_the_step(driven.ordered, disturbed, state, False), acting
-        verdict = self._verdict(view, own[self.p.heads, SPEED], acceleration, swing, disturbed.measurement)
+        verdict = self._verdict(view, own[self.p.leading, SPEED], acceleration, swing, disturbed.measurement)
         calm = disturbed.calm() if self.disturbing else disturbed
         moved = over_the_step(driven.ordered, calm, plant.copied(state), True)
         within, acts = applied(verdict, moved.motion.asked)
@@ -68,7 +68,7 @@ class Protect:
         if acts_on or self.disturbing:
             ordered = np.where(acts, within, driven.ordered) if acts_on else driven.ordered
             moved = over_the_step(ordered, disturbed, state, False)
-        self._tell(t, verdict, acts, acting, view, own[self.p.heads, SPEED])
+        self._tell(t, verdict, acts, acting, view, own[self.p.leading, SPEED])
         return moved, acts
 
     def _verdict(self, view: View, speed: Floats, acceleration: Floats, swing: Floats, error: Floats) -> supervisor.Verdict:

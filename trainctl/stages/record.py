@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from trainctl.railway.ways import Ways
-    from trainctl.scenario.model import Prepared
+    from trainctl.scenario.model import Model
     from trainctl.stages.traffic import Around
     from trainctl.stages.traffic import State as Traffic
 
@@ -34,7 +34,7 @@ DISTURBANCES = (
 class Journal:
     """The tables of one run, filled row by row."""
 
-    def __init__(self, folder: Path, p: Prepared, resume: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, folder: Path, p: Model, resume: Mapping[str, Any] | None = None) -> None:
         self.p = p
         self.silent = False  # while a run that is resumed begins again
         self.has_units, self.has_energies = p.has_units, p.has_units or p.self_driven
@@ -125,7 +125,7 @@ class State(NamedTuple):
 class Record:
     """Hands every instant to the journal, and watches the bounds at every step, recorded or not."""
 
-    def __init__(self, p: Prepared, journal: Journal) -> None:
+    def __init__(self, p: Model, journal: Journal) -> None:
         self.p, self.journal = p, journal
         self.alarms = monitor.Alarms(p)
         self.track_of = np.array([p.line.track_ids.index(t) for t in p.line.tracks], np.int64)
@@ -169,7 +169,7 @@ class Record:
         """
         assert formed.links is not None
         row = Row(
-            time=t, seen=seen, track=self.track_of[seen.edge], own=own, speed=own[self.p.heads, SPEED], ahead=formed.ahead,
+            time=t, seen=seen, track=self.track_of[seen.edge], own=own, speed=own[self.p.leading, SPEED], ahead=formed.ahead,
             links=formed.links, motion=motion, saturated=demand.saturated if motion is None else demand.saturated | motion.limited,
             extremes=past, disturbed=disturbed, led=formed.led,
         )  # fmt: skip

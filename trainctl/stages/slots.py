@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import Floats, Formed, Ints, Links, References, Seen
 from trainctl.stages.record import Journal
 from trainctl.stages.traffic import Around
@@ -25,7 +25,7 @@ class Slots:
 
     CHECKS = True  # whether a law's start condition is asked again where links changed
 
-    def __init__(self, p: Prepared, journal: Journal) -> None:
+    def __init__(self, p: Model, journal: Journal) -> None:
         self.p, self.journal = p, journal
         self.track_of = np.array([p.line.track_ids.index(t) for t in p.line.tracks], np.int64)
 

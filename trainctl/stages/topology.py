@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import Floats, Formed, Links, Messages, Scene, Seen
 from trainctl.stages.convoys import Convoys
 from trainctl.stages.record import Journal
@@ -30,7 +30,7 @@ class Sorted(NamedTuple):
 class Topology:
     """A formation rule, and what new links mean to messages and law."""
 
-    def __init__(self, p: Prepared, journal: Journal) -> None:
+    def __init__(self, p: Model, journal: Journal) -> None:
         self.p, self.journal = p, journal
         self.rule = Slots(p, journal) if p.placed else Convoys(p, journal)
 

@@ -12,7 +12,7 @@ from trainctl.railway import along, authority, interlocking, supervisor
 from trainctl.railway.authority import DRIVER_MARGIN_M, View
 from trainctl.railway.interlocking import Held
 from trainctl.railway.ways import Ways
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.scenario.roster import Stop
 from trainctl.signals import Bools, Floats, Ints, Seen
 from trainctl.stages.record import Journal
@@ -37,7 +37,7 @@ class State(NamedTuple):
     stopping: Bools  # for its next stop
     parked: Bools  # off the track, at a stop
     waits_for: Ints  # train that each is held by at a switch, -1 if none
-    claims: interlocking.State
+    requests: interlocking.State
 
     @property
     def standing(self) -> Bools:
@@ -69,7 +69,7 @@ def nothing(trains: int) -> Around:
 class Traffic:
     """The traffic of a run."""
 
-    def __init__(self, p: Prepared, journal: Journal) -> None:
+    def __init__(self, p: Model, journal: Journal) -> None:
         self.p, self.journal, self.roster = p, journal, p.roster
         self.rules, self.assumed = p.driver_rules, p.relied_on_by_driver
         self.step_s, self.theta = p.scenario.run.step_s, p.step_theta
@@ -79,7 +79,7 @@ class Traffic:
         planned = min(
             p.supervision.emergency_mps2, p.supervision.service_mps2, *([p.driving.deceleration_mps2] if p.driven else [])
         )
-        self.claiming = np.minimum(p.assumed.braking, planned)  # what is claimed for, and braked with at least
+        self.requesting = np.minimum(p.assumed.braking, planned)  # what is requested for, and braked with at least
         self.ways: Ways | None = None
 
     def initial(self) -> State:
@@ -88,7 +88,7 @@ class Traffic:
         return State(
             came=np.full(n, self.roster.placed), left=np.zeros(n, bool), next_stop=np.zeros(n, np.int64),
             stands_until=np.full(n, np.nan), stopping=np.zeros(n, bool), parked=np.zeros(n, bool),
-            waits_for=np.full(n, -1), claims=interlocking.none(),
+            waits_for=np.full(n, -1), requests=interlocking.none(),
         )  # fmt: skip
 
     def step(
@@ -147,7 +147,7 @@ class Traffic:
         """Trains of those that are ``due`` whose place is clear, with the speed they come with [m/s]; who keeps out the others."""
         asking = np.zeros(len(speed), bool)
         asking[due] = True
-        s, held = self._claim(t, ways, here, self._reach(speed) if reach is None else reach, asking, s)
+        s, held = self._request(t, ways, here, self._reach(speed) if reach is None else reach, asking, s)
         s = s._replace(parked=s.parked.copy(), stands_until=s.stands_until.copy())
         present, came, come, kept_out = here.present.copy(), s.came.copy(), [], {}
         for i in due:
@@ -287,18 +287,18 @@ class Traffic:
     # Turns, and what is ahead
 
     def _reach(self, speed: Floats) -> Floats:
-        """How far ahead every train claims [m]: farther than it would brake for what it must not enter."""
+        """How far ahead every train requests [m]: farther than it would brake for what it must not enter."""
         assumed, rules = self.p.assumed, self.p.supervision
         v = np.maximum(speed, 0.0) + assumed.drift + 2.0 * assumed.lag * rules.emergency_mps2
-        braking = supervisor.stopping_distance(v, self.claiming, self.step_s, self.theta)
+        braking = supervisor.stopping_distance(v, self.requesting, self.step_s, self.theta)
         return braking + 4.0 * v * self.step_s + rules.margin_m + 2.0 * DRIVER_MARGIN_M + 50.0 + 6.0 * assumed.uncertainty
 
-    def _claim(self, t: float, ways: Ways, seen: Seen, reach: Floats, entering: Bools, s: State) -> tuple[State, Held]:
-        """Let every train claim what lies within its reach; ``entering`` (n,) are those that ask to enter the net."""
+    def _request(self, t: float, ways: Ways, seen: Seen, reach: Floats, entering: Bools, s: State) -> tuple[State, Held]:
+        """Let every train request what lies within its reach; ``entering`` (n,) are those that ask to enter the net."""
         if self.ways is not ways:  # they changed
             self.ways, self.zones = ways, interlocking.zones(ways, self.net)
-        claims, held, said = interlocking.claim(
-            self.zones, s.claims, seen.row, seen.position, self.length, seen.present, reach,
+        requests, held, said = interlocking.request(
+            self.zones, s.requests, seen.row, seen.position, self.length, seen.present, reach,
             self.p.supervision.margin_m + DRIVER_MARGIN_M, entering,
         )  # fmt: skip
         ids, edges = self.p.scenario.ids, self.p.rails.edges
@@ -310,7 +310,7 @@ class Traffic:
                 )  # fmt: skip
             elif one.granted and not one.join and s.waits_for[one.train] >= 0:
                 self.journal.event(t, "switch_granted", train=ids[one.train], edge=edges[one.zone])
-        return s._replace(claims=claims, waits_for=held.by.copy()), held
+        return s._replace(requests=requests, waits_for=held.by.copy()), held
 
     def _look(self, ways: Ways, seen: Seen, speed: Floats, held: Held, s: State, reach: Floats) -> View:
         """What is ahead of every train."""
@@ -319,5 +319,5 @@ class Traffic:
             horizon = max(horizon, self.p.driving.join_range_m)
         return authority.look(
             ways, self.net, self.p.rails.speed_mps, self.roster.speed_factor, seen.row, seen.position, speed, self.length,
-            seen.present, horizon, held.room, interlocking.order(s.claims),
+            seen.present, horizon, held.room, interlocking.order(s.requests),
         )  # fmt: skip

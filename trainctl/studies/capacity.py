@@ -71,7 +71,7 @@ MEASURED = (
 COLUMNS = {
     "row": "row", "headway [s]": "headway_s", "mean [s]": "headway_mean_s", "trains/h": "trains_per_hour",
     "journey [s]": "journey_time_s", "kWh/km": "energy_kwh_per_train_km", "collided": "collisions",
-    "least gap [m]": "least_gap_m", "spacing [m]": "spacing_m", "wall time [s]": "wall_time_s",
+    "minimum gap [m]": "least_gap_m", "spacing [m]": "spacing_m", "wall time [s]": "wall_time_s",
 }  # fmt: skip
 
 LINE_FILE = "capacity.toml"
@@ -83,7 +83,7 @@ BAND_MPS = 0.5
 SPARE_S = 120.0
 
 
-class Plan(NamedTuple):
+class CapacityPlan(NamedTuple):
     """What is compared."""
 
     trains: int = 40
@@ -113,7 +113,7 @@ class Plan(NamedTuple):
         return self.speed_mps - self.reserve_mps
 
 
-def line(plan: Plan) -> dict[str, Any]:
+def line(plan: CapacityPlan) -> dict[str, Any]:
     """The line's description; its run-out is as long as the lead-in, so that a whole formation leaves the stretch."""
     return {
         "name": "capacity", "tracks": ["1"], "length_m": plan.end_m + plan.begin_m + SPARE_S * plan.speed_mps + 5000.0,
@@ -121,7 +121,7 @@ def line(plan: Plan) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def scenario(plan: Plan, row: str) -> dict[str, Any]:
+def scenario(plan: CapacityPlan, row: str) -> dict[str, Any]:
     """Tables of a row's scenario, but for ``network``."""
     n = plan.trains
     errors = np.random.default_rng(plan.seed).uniform(-1.0, 1.0, (n, 2)) * (plan.position_error_m, plan.speed_error_mps)
@@ -150,7 +150,7 @@ def scenario(plan: Plan, row: str) -> dict[str, Any]:
     return {**tables, **law.on_a_line(tables, _band(plan))}
 
 
-def _sumo(plan: Plan, row: str, tables: dict[str, Any]) -> dict[str, Any]:
+def _sumo(plan: CapacityPlan, row: str, tables: dict[str, Any]) -> dict[str, Any]:
     """Tables of one of SUMO's rows."""
     block = row.partition("_")[0]
     controller = {"law": "sumo", "block": block, "entry_m": plan.begin_m, "top_speed_mps": plan.speed_mps}
@@ -159,8 +159,8 @@ def _sumo(plan: Plan, row: str, tables: dict[str, Any]) -> dict[str, Any]:
     return {"controller": controller, "run": {**tables["run"], "duration_s": math.ceil(sumo_duration(plan))}}
 
 
-def headway_bound(plan: Plan, block: str) -> float:
-    """Least time between two trains [s] of which the second never brakes, if the first keeps the line's speed.
+def headway_bound(plan: CapacityPlan, block: str) -> float:
+    """Minimum time between two trains [s] of which the second never brakes, if the first keeps the line's speed.
 
     It sees the absolute braking distance ahead of it free: up to the last signal before the train ahead, or up to 50 m from it. The
     step of 1 s in which SUMO decides comes on top.
@@ -170,13 +170,13 @@ def headway_bound(plan: Plan, block: str) -> float:
     return (braking + behind + float(ICE3["unit_length_m"])) / plan.speed_mps + 1.0
 
 
-def sumo_duration(plan: Plan) -> float:
+def sumo_duration(plan: CapacityPlan) -> float:
     """Time in which SUMO's trains are surely through [s]: all enter one after the other, each twice as slow as it should be."""
     braking = plan.speed_mps**2 / (2.0 * SUMO_BRAKING_MPS2)
     return 2.0 * (plan.trains * (braking + 2.0 * plan.signals_m) + plan.length_m) / plan.speed_mps + 1000.0
 
 
-def _band(plan: Plan) -> dict[str, float]:
+def _band(plan: CapacityPlan) -> dict[str, float]:
     """Speed bounds for the laws that have both."""
     return {"speed_lower_mps": plan.cruise_mps - BAND_MPS, "speed_upper_mps": plan.speed_mps}
 
@@ -184,14 +184,14 @@ def _band(plan: Plan) -> dict[str, float]:
 # What is measured
 
 
-def measure(run: Run, plan: Plan) -> dict[str, Any]:
+def measure(run: Run, plan: CapacityPlan) -> dict[str, Any]:
     """A row of the table from a finished run, without its name.
 
     Parameters
     ----------
     run : Run
         A run of one of the ``ROWS``.
-    plan : Plan
+    plan : CapacityPlan
         What it was made from.
 
     Returns
@@ -238,7 +238,7 @@ class Journey(NamedTuple):
     spacing_m: float  # to the train ahead as it left; NaN for the first
 
 
-def journey(rows: pd.DataFrame, plan: Plan) -> Journey | None:
+def journey(rows: pd.DataFrame, plan: CapacityPlan) -> Journey | None:
     """The journey of one train; None if it did not reach the end. Between two rows everything is taken to grow evenly."""
     position, time = rows["position_m"].to_numpy(), rows["time_s"].to_numpy()
     if position[0] >= plan.end_m or position[-1] < plan.end_m:
@@ -266,7 +266,7 @@ def _finite(value: float) -> float | None:
 
 
 def compare(
-    plan: Plan,
+    plan: CapacityPlan,
     out: Path,
     rows: Sequence[str] = ROWS,
     workers: int | None = None,
@@ -276,7 +276,7 @@ def compare(
 
     Parameters
     ----------
-    plan : Plan
+    plan : CapacityPlan
         What is compared.
     out : Path
         Receives the line (``capacity.toml``), the scenarios (``ROW.toml``) and the run folders (``ROW``).
@@ -310,7 +310,7 @@ def compare(
     return [{"row": row, **done[row]} for row in rows]
 
 
-def prepare_files(plan: Plan, out: Path, rows: Sequence[str]) -> None:
+def prepare_files(plan: CapacityPlan, out: Path, rows: Sequence[str]) -> None:
     """Write the line and the scenarios of the rows."""
     found = [f"--{key}: must be {rule}" for key, rule, holds in (
         ("trains", "at least 2", plan.trains >= 2),
@@ -332,7 +332,7 @@ def prepare_files(plan: Plan, out: Path, rows: Sequence[str]) -> None:
         (out / f"{row}.toml").write_text(tomli_w.dumps(tables), encoding="utf-8")
 
 
-def _alone(file: Path, out: Path, plan: Plan) -> dict[str, Any]:
+def _alone(file: Path, out: Path, plan: CapacityPlan) -> dict[str, Any]:
     """Run a row in a process that ends with it: libsumo holds one simulation, and a crash is that row's only."""
     try:
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
@@ -341,7 +341,7 @@ def _alone(file: Path, out: Path, plan: Plan) -> dict[str, Any]:
         return {**dict.fromkeys(MEASURED), "error": str(error)}
 
 
-def one(file: Path, out: Path, plan: Plan) -> dict[str, Any]:
+def one(file: Path, out: Path, plan: CapacityPlan) -> dict[str, Any]:
     """Run and measure one row in this process; why it failed, if it did."""
     from trainctl import runner
     from trainctl.scenario.build import open_scenario
@@ -359,14 +359,14 @@ def one(file: Path, out: Path, plan: Plan) -> dict[str, Any]:
 #: Panels: key -> label.
 PANELS = {
     "headway_s": "headway at\nthe end [s]", "trains_per_hour": "trains per\nhour [1/h]", "journey_time_s": "journey\ntime [s]",
-    "energy_kwh_per_train_km": "traction energy\n[kWh per train-km]", "least_gap_m": "least gap [m]\n(collisions)",
+    "energy_kwh_per_train_km": "traction energy\n[kWh per train-km]", "least_gap_m": "minimum gap [m]\n(collisions)",
 }  # fmt: skip
 
 
-def figure(table: Sequence[dict[str, Any]], plan: Plan, path: Path, formats: Sequence[str] = ("png",)) -> list[Path]:
+def figure(table: Sequence[dict[str, Any]], plan: CapacityPlan, path: Path, formats: Sequence[str] = ("png",)) -> list[Path]:
     """Draw the table as bars, with what each row could reach at best dashed.
 
-    Dashed is steady running that nobody hinders: in SUMO's rows at the line's speed, at the least headway at which no train brakes;
+    Dashed is steady running that nobody hinders: in SUMO's rows at the speed of the line and the minimum headway without braking;
     in the laws' rows at cruising speed and the desired spacing.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -406,7 +406,7 @@ def figure(table: Sequence[dict[str, Any]], plan: Plan, path: Path, formats: Seq
         return style.save(drawn, path, formats)
 
 
-def ideal(plan: Plan, row: str) -> dict[str, float]:
+def ideal(plan: CapacityPlan, row: str) -> dict[str, float]:
     """What a row could reach at best, by the keys of ``PANELS``."""
     own = row in SUMO_ROWS
     speed = plan.speed_mps if own else plan.cruise_mps

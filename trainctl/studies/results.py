@@ -63,7 +63,7 @@ def reasons(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def shares(folder: Path, varied: Sequence[str]) -> list[dict[str, Any]]:
-    """Share of complete runs with a broken bound for every combination of the settings ``varied``, seeds taken together."""
+    """Share of complete runs with a violated bound for every combination of the settings ``varied``, seeds taken together."""
     import pandas as pd
 
     frame = pd.read_parquet(folder / RESULTS)

@@ -38,7 +38,7 @@ ONE_SIMULATION = threading.Lock()
 
 
 @dataclass(frozen=True)
-class Plan:
+class SweepPlan:
     """What to run: every combination of ``settings`` with every seed.
 
     ``jitter`` maps keys of ``[[train]]`` to the half width of a uniform deviation, drawn for every train from the run's seed.
@@ -126,7 +126,7 @@ def sweeps() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
-def ready_made(name: str) -> Plan | None:
+def ready_made(name: str) -> SweepPlan | None:
     """The plan in a sweep file, given by path or as the name of a shipped one; None if ``name`` is a scenario."""
     path = Path(name)
     if path.suffix != ".toml":
@@ -148,12 +148,12 @@ def ready_made(name: str) -> Plan | None:
         jitter = dict(half_width(f"{k}={v}") for k, v in data.get("jitter", {}).items())
         beside = path.parent / str(data["scenario"])
         scenario = str(beside) if beside.suffix == ".toml" and beside.is_file() else str(data["scenario"])
-        return Plan(scenario, settings, seeds(str(data["seeds"])) if "seeds" in data else [], jitter)
+        return SweepPlan(scenario, settings, seeds(str(data["seeds"])) if "seeds" in data else [], jitter)
     except (InputError, AttributeError) as error:
         raise InputError(f"{path.name}: {error}") from None
 
 
-def jobs(plan: Plan, keep: Path | None = None) -> list[Job]:
+def jobs(plan: SweepPlan, keep: Path | None = None) -> list[Job]:
     """All runs of a plan, checked as far as that is the same for all of them.
 
     Raises
@@ -189,7 +189,7 @@ def jobs(plan: Plan, keep: Path | None = None) -> list[Job]:
             raise InputError([f"{file.name}: {line}" for line in wrong])
     for job in found[:20]:  # one combination that can run is enough: others may be what the sweep is to find out
         try:
-            prepared(job._replace(jitter={}))
+            job_model(job._replace(jitter={}))
         except InputError as error:
             refused = refused or error.mistakes
         else:
@@ -203,16 +203,16 @@ def jobs(plan: Plan, keep: Path | None = None) -> list[Job]:
     return found
 
 
-def prepared(job: Job) -> Any:
+def job_model(job: Job) -> Any:
     """The run's scenario as arrays, its starts moved by the jitter."""
-    from trainctl.scenario.build import prepare
+    from trainctl.scenario.build import model_of
 
     tables = {**job.tables, "train": [dict(train) for train in job.tables.get("train", [])]}
     _move(tables, job.jitter)
     scenario, found = examine(tables)
     if scenario is None:
         raise InputError([f"{job.file}: {line}" for line in found])
-    return prepare(scenario, job.file, Path(job.folder), found)
+    return model_of(scenario, job.file, Path(job.folder), found)
 
 
 def _move(tables: dict[str, Any], jitter: Mapping[str, float]) -> None:
@@ -253,7 +253,7 @@ def _outcome(job: Job, folder: Path) -> dict[str, Any]:
     from trainctl import runner
     from trainctl.record.folder import plain
 
-    p = prepared(job)
+    p = job_model(job)
     done = runner.run(p, folder, job.backend, job.keep is not None)  # type: ignore[arg-type]
     values = {key: value for key, value in done.metrics.items() if "/" not in key and isinstance(value, int | float)}
     told = {key: done.info[key] for key in COUNTS}
@@ -264,7 +264,7 @@ def _outcome(job: Job, folder: Path) -> dict[str, Any]:
 
 
 def sweep(
-    plan: Plan,
+    plan: SweepPlan,
     out: Path,
     *,
     workers: int | None = None,
@@ -279,7 +279,7 @@ def sweep(
 
     Parameters
     ----------
-    plan : Plan
+    plan : SweepPlan
         What to run.
     out : Path
         Folder of the sweep.
@@ -310,7 +310,7 @@ def sweep(
     """
     todo = jobs(plan, Path(os.path.abspath(out)) / "runs" if keep else None)
     identity = _identity(plan, todo[0])
-    rows = _claim(out, identity, resume, force)
+    rows = _open_folder(out, identity, resume, force)
     known = {_key(job.parameters) for job in todo}
     rows = {key: row for key, row in rows.items() if key in known and row["status"] != "failed"}
     info = _about(identity, plan, todo, command_line)
@@ -321,13 +321,13 @@ def sweep(
         ordered = [{**rows[key], "run": job.number} for job in todo if (key := _key(job.parameters)) in rows]
         frame = write_results(ordered, out / RESULTS)
         counts = {name: sum(row["status"] == name for row in ordered) for name in ("complete", "failed", "refused")}
-        broken = sum(row["status"] == "complete" and row["violations"] > 0 for row in ordered)
+        violated = sum(row["status"] == "complete" and row["violations"] > 0 for row in ordered)
         complete = counts["complete"]
         violated = {
-            "runs": broken,
+            "runs": violated,
             "of": complete,
-            "share": broken / complete if complete else None,
-            "interval_95": wilson(broken, complete),
+            "share": violated / complete if complete else None,
+            "interval_95": wilson(violated, complete),
         }
         if complete:
             from trainctl.figures.sweep import summary
@@ -417,14 +417,14 @@ def _key(parameters: Mapping[str, Any]) -> str:
     return json.dumps(parameters, sort_keys=True, default=str)
 
 
-def _identity(plan: Plan, first: Job) -> dict[str, Any]:
+def _identity(plan: SweepPlan, first: Job) -> dict[str, Any]:
     """What must be the same for rows to belong to one dataset."""
     tables, _ = read(plan.scenario)
     digest = hashlib.sha256(json.dumps(tables, sort_keys=True, default=str).encode()).hexdigest()
     return {"scenario": first.file, "scenario_sha256": digest, "jitter": dict(plan.jitter), "backend": plan.backend}
 
 
-def _about(identity: Mapping[str, Any], plan: Plan, todo: Sequence[Job], command_line: Sequence[str]) -> dict[str, Any]:
+def _about(identity: Mapping[str, Any], plan: SweepPlan, todo: Sequence[Job], command_line: Sequence[str]) -> dict[str, Any]:
     from trainctl.record.folder import SCHEMA_VERSION, installed
 
     return {
@@ -441,7 +441,7 @@ def _write_info(out: Path, info: Mapping[str, Any]) -> None:
     write_json(out / INFO, info)
 
 
-def _claim(out: Path, identity: Mapping[str, Any], resume: bool, force: bool) -> dict[str, dict[str, Any]]:
+def _open_folder(out: Path, identity: Mapping[str, Any], resume: bool, force: bool) -> dict[str, dict[str, Any]]:
     """Make the folder ready; rows that are there already, by their parameters."""
     from trainctl.record.folder import free, remove
 

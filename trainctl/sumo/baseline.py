@@ -12,7 +12,7 @@ import numpy as np
 
 from trainctl.errors import CouplingError
 from trainctl.railway.ways import ways
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import Bools, Floats, Ints, Observed, Seen
 from trainctl.sumo.baseline_files import departures, verify_signals, write_configuration, write_routes
 from trainctl.sumo.session import TOLERANCE_M, Session
@@ -26,7 +26,7 @@ class Baseline(Session):
 
     Parameters
     ----------
-    p : Prepared
+    p : Model
         A scenario with ``law = "sumo"``.
     net : Path
         Its net, in ``folder``.
@@ -39,7 +39,7 @@ class Baseline(Session):
         The trains cannot enter where ``entry_m`` says, or there are no signals where there must be some.
     """
 
-    def __init__(self, p: Prepared, net: Path, folder: Path) -> None:
+    def __init__(self, p: Model, net: Path, folder: Path) -> None:
         run, line = p.scenario.run, p.line
         super().__init__(line, net, folder, run.step_s, run.steps, run.record_every_s)
         verify_signals(p)

@@ -10,12 +10,12 @@ import numpy as np
 
 from sumo_net.netfile import content
 from trainctl.errors import InputError
-from trainctl.scenario.model import Prepared
+from trainctl.scenario.model import Model
 from trainctl.signals import SPEED, Floats
 from trainctl.sumo.session import OPTIONS, fcd_period, normal
 
 
-class Stop(NamedTuple):
+class VehicleStop(NamedTuple):
     """Where a train waits."""
 
     edge: str
@@ -25,7 +25,7 @@ class Stop(NamedTuple):
     parks: bool  # off the track
 
 
-class Departure(NamedTuple):
+class Vehicle(NamedTuple):
     """A train as SUMO lets it in."""
 
     id: str
@@ -37,11 +37,11 @@ class Departure(NamedTuple):
     top_speed: float  # m/s
     speed_factor: float  # share of a speed limit that it keeps to
     placed: bool  # whatever SUMO thinks of it
-    stops: tuple[Stop, ...]
+    stops: tuple[VehicleStop, ...]
     arrival_m: float = np.inf  # where on the last edge it leaves; inf: at its end
 
 
-def verify_signals(p: Prepared) -> None:
+def verify_signals(p: Model) -> None:
     """Whether a net that came as a file has the signals that fixed block needs.
 
     Raises
@@ -54,7 +54,7 @@ def verify_signals(p: Prepared) -> None:
         raise InputError(f"{p.file}: controller.block = fixed: {p.net.name} {rule}")
 
 
-def departures(p: Prepared) -> list[Departure]:
+def departures(p: Model) -> list[Vehicle]:
     """The trains of a scenario, one each.
 
     Raises
@@ -70,7 +70,7 @@ def departures(p: Prepared) -> list[Departure]:
     found = []
     for k, (t, top) in enumerate(zip(p.scenario.train, _top_speeds(p).tolist(), strict=True)):
         position = t.position_m if entry is None else entry
-        found.append(Departure(
+        found.append(Vehicle(
             id=t.id, vclass="rail", route=tuple(line.route(t.track, position)), position_m=float(line.locate(t.track, position)[1]),
             depart=k * p.params.entry_every_s, speed=float(t.speed_mps) if entry is None else p.params.entry_speed_mps,
             top_speed=top, speed_factor=1.0, placed=entry is None, stops=(),
@@ -78,8 +78,8 @@ def departures(p: Prepared) -> list[Departure]:
     return found
 
 
-def _top_speeds(p: Prepared) -> Floats:
-    """Greatest speed of every train [m/s], shape (n,)."""
+def _top_speeds(p: Model) -> Floats:
+    """Maximum speed of every train [m/s], shape (n,)."""
     if p.params.top_speed_mps is not None:
         return np.full(len(p.scenario.ids), p.params.top_speed_mps)
     instants = np.arange(p.scenario.run.steps + 1) * p.scenario.run.step_s
@@ -87,7 +87,7 @@ def _top_speeds(p: Prepared) -> Floats:
     return np.where(np.isfinite(p.bounds.speed_upper), p.bounds.speed_upper, wanted)
 
 
-def _coming(p: Prepared) -> list[Departure]:
+def _coming(p: Model) -> list[Vehicle]:
     """The trains of a SUMO configuration, as its files have them."""
     roster, rails = p.roster, p.rails
     found = []
@@ -97,11 +97,11 @@ def _coming(p: Prepared) -> list[Departure]:
         stops = []
         for stop in roster.stops[i]:
             row = int(np.searchsorted(begin, stop.place, side="left")) - 1
-            stops.append(Stop(rails.edges[way[row]], float(stop.place - begin[row]), stop.duration, stop.until, stop.parks))
+            stops.append(VehicleStop(rails.edges[way[row]], float(stop.place - begin[row]), stop.duration, stop.until, stop.parks))
         # Whoever would start faster than it may is refused by SUMO, in the middle of the run.
         speed = min(float(roster.speed[i]), float(roster.speed_factor[i] * rails.speed_mps[way[0]]))
         top = p.params.top_speed_mps
-        found.append(Departure(
+        found.append(Vehicle(
             id=name, vclass=roster.vclass[i], route=roster.routes[i], position_m=float(roster.lane_position[i]),
             depart=float(roster.depart[i]), speed=None if np.isnan(speed) else speed,
             top_speed=float(roster.top_speed[i]) if top is None else min(top, float(roster.top_speed[i])),
@@ -110,7 +110,7 @@ def _coming(p: Prepared) -> list[Departure]:
     return found
 
 
-def write_routes(p: Prepared, trains: list[Departure], path: Path) -> None:
+def write_routes(p: Model, trains: list[Vehicle], path: Path) -> None:
     """The trains as SUMO vehicles: true lengths, no randomness, driven by the ``Rail`` model."""
     lengths = np.maximum(p.consists.train_length(), 1.0).tolist()  # SUMO has no points
     keys = [(d.vclass, length, d.top_speed, d.speed_factor) for d, length in zip(trains, lengths, strict=True)]
@@ -146,7 +146,7 @@ def _words(attributes: dict[str, str | None]) -> str:
     return "".join(f" {key}={quoteattr(value)}" for key, value in attributes.items() if value is not None)
 
 
-def write_configuration(p: Prepared, net: str, folder: Path) -> Path:
+def write_configuration(p: Model, net: str, folder: Path) -> Path:
     """``run.sumocfg``: what SUMO's own programs run without us. Insertion follows SUMO's rules."""
     internal = any(edge.startswith(":") for edge in p.line.edges)
     options = {

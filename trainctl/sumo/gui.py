@@ -69,7 +69,7 @@ class Gui(Sumo):
     binary : str
         Program to start.
     delay_ms : float
-        Least time of a step on the screen.
+        Minimum time of a step on the screen.
     """
 
     api: Any = traci

@@ -35,7 +35,7 @@ def replay(run: Run, binary: str = "sumo-gui", from_s: float = 0.0, delay_ms: fl
     from_s : float
         Where to begin [s].
     delay_ms : float
-        Least time of a step on the screen.
+        Minimum time of a step on the screen.
 
     Returns
     -------

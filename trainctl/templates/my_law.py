@@ -4,7 +4,7 @@ Symbols
 -------
 k        how much faster for each metre of spacing error [1/s]
 h        how fast the train takes up the speed it wants [1/s]
-a        greatest acceleration it asks for, up or down [m/s2]
+a        maximum acceleration it asks for, up or down [m/s2]
 e        spacing error to a neighbour, positive if that one is too far ahead [m]
 """
 
@@ -25,7 +25,7 @@ class Params(Table):
 
     k_per_s: float = Field(0.02, gt=0.0, description="Gain of the spacing errors [1/s]")
     h_per_s: float = Field(0.1, gt=0.0, description="Gain of the speed error [1/s]")
-    a_mps2: float = Field(0.15, gt=0.0, description="Greatest acceleration asked for [m/s2]")
+    a_mps2: float = Field(0.15, gt=0.0, description="Maximum acceleration asked for [m/s2]")
     slower_mps: float = Field(1.0, gt=0.0, description="Most by which it wants to be slower than the reference [m/s]")
     faster_mps: float = Field(4.0, gt=0.0, description="Most by which it wants to be faster than the reference [m/s]")
 

@@ -9,22 +9,22 @@ from xml.etree.ElementTree import Element
 from sumo_net.netfile import RAIL, NetFile
 from trainctl.errors import InputError
 from trainctl.traffic import known
-from trainctl.traffic.files import PEOPLE, PLACES, Demand, is_time, routes_of, types_of
+from trainctl.traffic.files import PEOPLE, PLACES, Elements, is_time, routes_of, types_of
 from trainctl.traffic.kinds import Kind
 from trainctl.traffic.places import NO_RAIL, Tracks, off_route, place_of, unconnected
 
 
-def rail_trains(demand: Demand, kinds: dict[str, Kind]) -> tuple[list[Element], list[str]]:
+def rail_trains(elements: Elements, kinds: dict[str, Kind]) -> tuple[list[Element], list[str]]:
     """The trains among the vehicles, and what is left out."""
     trains, others = [], 0
-    for train in demand.trains:
+    for train in elements.trains:
         name = train.get("type", "DEFAULT_VEHTYPE")
-        types = types_of(demand.mixes[name]) if name in demand.mixes else [name]
+        types = types_of(elements.mixes[name]) if name in elements.mixes else [name]
         # A type that does not exist is a mistake, told later.
         rail = [t for t in types if t not in kinds or kinds[t].vclass in RAIL]
         trains += [train] * bool(rail)
         others += not rail
-    counts = Counter(PEOPLE[e.tag] for e in demand.others if e.tag in PEOPLE)
+    counts = Counter(PEOPLE[e.tag] for e in elements.others if e.tag in PEOPLE)
     notes = [f"{n} definitions of {word} left out" for word, n in counts.items() if n]
     notes += [f"{others} vehicles, trips and flows left out: not rail"] if others else []
     places = {t.get("departPos", "") for t in trains} & {"random", "free", "random_free", "last", "splitFront"}
@@ -36,7 +36,7 @@ def rail_trains(demand: Demand, kinds: dict[str, Kind]) -> tuple[list[Element], 
     if any(t.get("arrivalPos") == "random" for t in trains):
         notes.append('arrivalPos="random": at the end of the edge')
     drawn = {t.get("type", "") for t in trains}
-    drawn |= {member for name in drawn & set(demand.mixes) for member in types_of(demand.mixes[name])}
+    drawn |= {member for name in drawn & set(elements.mixes) for member in types_of(elements.mixes[name])}
     for name in sorted(drawn & set(kinds)):
         if "(" in (text := kinds[name].attributes.get("speedFactor", "")):
             notes.append(f"vType {name}: speedFactor = {text}: its mean {kinds[name].speed_factor:g} for every train")
@@ -44,24 +44,24 @@ def rail_trains(demand: Demand, kinds: dict[str, Kind]) -> tuple[list[Element], 
 
 
 def not_followed(
-    options: dict[str, str], trains: list[Element], demand: Demand, kinds: dict[str, Kind], net: NetFile
+    options: dict[str, str], trains: list[Element], elements: Elements, kinds: dict[str, Kind], net: NetFile
 ) -> tuple[list[str], list[str]]:
     """What of the files of a configuration is not followed, one line each; and what is refused."""
     own = {id(e) for t in trains for e in t.iter()}
-    given = list({id(r): r for t in trains for r in routes_of(t, demand) if id(r) not in own}.values())
+    given = list({id(r): r for t in trains for r in routes_of(t, elements) if id(r) not in own}.values())
     named = {t.get("type", "DEFAULT_VEHTYPE") for t in trains}
-    named |= {member for name in named & set(demand.mixes) for member in types_of(demand.mixes[name])}
-    types = [e for name, e in demand.types.items() if name in named and kinds[name].vclass in RAIL]
+    named |= {member for name in named & set(elements.mixes) for member in types_of(elements.mixes[name])}
+    types = [e for name, e in elements.types.items() if name in named and kinds[name].vclass in RAIL]
     stops = {place for t in (*trains, *given) for s in t.iter("stop") for tag in PLACES for place in (s.get(tag),) if place}
-    places = [e for name, e in demand.places.items() if name in stops]
+    places = [e for name, e in elements.places.items() if name in stops]
     notes, refused = known.of_trains([*trains, *given, *types, *places])
-    return [*known.of_options(options), *notes, *known.of_others(demand.others), *known.of_net(net)], refused
+    return [*known.of_options(options), *notes, *known.of_others(elements.others), *known.of_net(net)], refused
 
 
-def refuse(sumocfg: Path, net: Path, trains: list[Element], demand: Demand, kinds: dict[str, Kind], tracks: Tracks) -> None:
+def refuse(sumocfg: Path, net: Path, trains: list[Element], elements: Elements, kinds: dict[str, Kind], tracks: Tracks) -> None:
     """Refuse trains whose names, types, times, routes or stops cannot be: one line for each mistake."""
     met = {e for t in trains for key in ("from", "via", "to") for e in t.get(key, "").split()}
-    met |= {e for t in trains for route in routes_of(t, demand) for e in route.get("edges", "").split()}
+    met |= {e for t in trains for route in routes_of(t, elements) for e in route.get("edges", "").split()}
     if trains and not tracks.marked and not met & tracks.onward.keys():
         raise InputError(f"{net}: {NO_RAIL}")
     if not trains:
@@ -71,23 +71,23 @@ def refuse(sumocfg: Path, net: Path, trains: list[Element], demand: Demand, kind
     for train in trains:
         who = f"{'flow' if train.tag == 'flow' else 'train'} {train.get('id', '')}"
         name = train.get("type", "DEFAULT_VEHTYPE")
-        types = types_of(demand.mixes[name]) if name in demand.mixes else [name]
+        types = types_of(elements.mixes[name]) if name in elements.mixes else [name]
         wrong += [f"{who}: type = {t}: no such vType" for t in types if t not in kinds]
         if seen[train.get("id", "")] > 1:
             wrong.append(f"{who}: there are several of this id")
         depart = train.get("depart", train.get("begin", "0"))
         if depart != "begin" and not is_time(depart):
             wrong.append(f"{who}: depart = {depart}: must be a time; what a train is to wait for is not known before the run")
-        routes = routes_of(train, demand)
+        routes = routes_of(train, elements)
         if train.get("route") and not routes:
             wrong.append(f"{who}: route = {train.get('route')}: no such route")
         ends = [*train.get("from", "").split(), *train.get("via", "").split(), *train.get("to", "").split()]
         wrong += [f"{who}: edge {e}: not in the net" for e in ends if e not in tracks.onward]
-        wrong += [f"{who}: {m}" for s in train.iter("stop") if (m := place_of(s, demand, tracks).wrong)]
+        wrong += [f"{who}: {m}" for s in train.iter("stop") if (m := place_of(s, elements, tracks).wrong)]
         for route in routes:
             wrong += [f"{who}: {m}" for m in unconnected(route.get("edges", "").split(), tracks)]
             stops = [*route.iter("stop"), *(s for s in train if s.tag == "stop")]
-            places = [place_of(s, demand, tracks) for s in stops]
+            places = [place_of(s, elements, tracks) for s in stops]
             wrong += [f"{who}: {p.wrong}" for p in places if p.wrong]
             if not {"repeat", "departEdge", "arrivalEdge"} & {*route.keys(), *train.keys()} and not any(p.wrong for p in places):
                 wrong += [f"{who}: {m}" for m in off_route(tuple(route.get("edges", "").split()), places)]

@@ -14,7 +14,7 @@ from xml.etree.ElementTree import Element
 from sumo_net.build import program
 from sumo_net.spec import LineError
 from trainctl.errors import InputError
-from trainctl.traffic.files import PLACES, Demand, parse, seconds
+from trainctl.traffic.files import PLACES, Elements, parse, seconds
 
 #: Seconds after which duarouter is taken for stuck.
 PATIENCE_S = 300.0
@@ -31,18 +31,18 @@ _STOP_KEYS = {"lane", "edge", "startPos", "endPos", "friendlyPos", "duration", "
 
 
 def expand(
-    trains: list[Element], demand: Demand, net: Path, work: Path, begin: float, end: float | None, seed: int
+    trains: list[Element], elements: Elements, net: Path, work: Path, begin: float, end: float | None, seed: int
 ) -> list[Element]:
     """The vehicles duarouter makes of the trains."""
     work.mkdir(parents=True, exist_ok=True)
     more, routes = Element("additional"), Element("routes")
-    more.extend(demand.places.values())
-    named = {id(t) for mix in demand.mixes.values() for t in mix}
-    more.extend(t for t in demand.types.values() if id(t) not in named)
-    more.extend(demand.mixes.values())
-    drawn = {id(r) for mix in demand.drawn.values() for r in mix}
-    routes.extend(_route(r) for r in demand.routes.values() if id(r) not in drawn)
-    for mix in demand.drawn.values():
+    more.extend(elements.places.values())
+    named = {id(t) for mix in elements.mixes.values() for t in mix}
+    more.extend(t for t in elements.types.values() if id(t) not in named)
+    more.extend(elements.mixes.values())
+    drawn = {id(r) for mix in elements.drawn.values() for r in mix}
+    routes.extend(_route(r) for r in elements.routes.values() if id(r) not in drawn)
+    for mix in elements.drawn.values():
         routes.append(_mix(mix))
     for train in trains:
         # duarouter ends with an error at a flow that begins too late for it.
@@ -57,10 +57,10 @@ def expand(
             elif child.tag == "routeDistribution":
                 bare.append(_mix(child))
         routes.append(bare)
-    for name, element in (("stops.add.xml", more), ("demand.rou.xml", routes)):
+    for name, element in (("stops.add.xml", more), ("elements.rou.xml", routes)):
         ElementTree.ElementTree(element).write(work / name, encoding="utf-8")
     options = {
-        "net-file": str(net.resolve()), "additional-files": "stops.add.xml", "route-files": "demand.rou.xml",
+        "net-file": str(net.resolve()), "additional-files": "stops.add.xml", "route-files": "elements.rou.xml",
         "output-file": "trains.rou.xml",
         "begin": f"{begin:.3f}", "seed": str(seed), "precision": "9", "xml-validation": "never", "no-step-log": "true",
         "unsorted-input": "true", "ignore-errors": "true",

@@ -26,7 +26,7 @@ _TRAINS = ("vehicle", "trip", "flow")
 PEOPLE = {"person": "persons", "personFlow": "persons", "container": "containers", "containerFlow": "containers"}
 
 
-class Demand(NamedTuple):
+class Elements(NamedTuple):
     """The files of a configuration, sorted by kind."""
 
     types: dict[str, Element]
@@ -68,9 +68,9 @@ def named_files(sumocfg: Path, options: dict[str, str], key: str) -> list[Path]:
     return [sumocfg.parent / name.strip() for name in re.split(r"[,;]", options.get(key, "")) if name.strip()]
 
 
-def read_demand(files: list[Path]) -> Demand:
+def read_demand(files: list[Path]) -> Elements:
     """What route files and additional files say, with the files they include; a name may be given once."""
-    d = Demand({}, {}, {}, {}, [], {}, [])
+    d = Elements({}, {}, {}, {}, [], {}, [])
     named = {"vType": d.types, "vTypeDistribution": d.mixes, "route": d.routes, "routeDistribution": d.drawn}
     wrong = []
     for path in files:
@@ -111,7 +111,7 @@ def types_of(mix: Element) -> list[str]:
     return [e.get("id", e.get("refId", "")) for e in mix if e.tag == "vType"] + mix.get("vTypes", "").split()
 
 
-def routes_of(train: Element, demand: Demand) -> list[Element]:
+def routes_of(train: Element, demand: Elements) -> list[Element]:
     """The routes a train is given, none for a trip."""
     own = [r for r in train.iter("route") if r.get("edges")]
     name = train.get("route", "")

@@ -6,7 +6,7 @@ import re
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
-#: Length [m] and greatest speed [m/s] of SUMO's vehicle classes.
+#: Length [m] and maximum speed [m/s] of SUMO's vehicle classes.
 _CLASS = {
     "rail": (135.0, 160 / 3.6), "rail_electric": (200.0, 220 / 3.6), "rail_fast": (200.0, 330 / 3.6),
     "rail_urban": (109.5, 100 / 3.6),

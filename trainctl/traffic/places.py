@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element
 from sumo_net.netfile import NetFile, for_trains, read_net
 from sumo_net.spec import LineError
 from trainctl.errors import InputError
-from trainctl.traffic.files import PLACES, Demand, bad_number, bad_time, is_time, seconds
+from trainctl.traffic.files import PLACES, Elements, bad_number, bad_time, is_time, seconds
 
 #: What is said of a road net.
 NO_RAIL = "has no rail edges: none of its lanes allows a rail class by name, and no route runs over one that lets everybody on"
@@ -63,14 +63,14 @@ def unmarked(edges: Iterable[str], tracks: Tracks) -> list[str]:
     return [e for e in dict.fromkeys(edges) if not any(for_trains(lane) for lane in lanes.get(e, []))]
 
 
-def place_of(stop: Element, demand: Demand, tracks: Tracks) -> Place:
+def place_of(stop: Element, elements: Elements, tracks: Tracks) -> Place:
     """Where a stop is: at a place with a name, or on a lane or an edge."""
     for tag in PLACES:
         if (name := stop.get(tag)) is not None:
             # SUMO takes a train stop for a bus stop, and duarouter writes it so.
-            if name not in demand.places:
+            if name not in elements.places:
                 return Place("", 0.0, f"stop at {tag} {name}: no such {tag}")
-            where = demand.places[name]
+            where = elements.places[name]
             break
     else:
         where, name = stop, ""

@@ -18,7 +18,7 @@ from trainctl.traffic.checks import not_followed, rail_trains, refuse
 from trainctl.traffic.duarouter import expand
 from trainctl.traffic.files import (
     PLACES,
-    Demand,
+    Elements,
     bad_number,
     is_number,
     is_time,
@@ -45,7 +45,7 @@ _WORDS = {
 DEPART_SPEED = "avg"
 
 
-class Stop(NamedTuple):
+class StopElement(NamedTuple):
     """Where a train waits."""
 
     edge: str
@@ -68,12 +68,12 @@ class Departure(NamedTuple):
     position_m: float  # of its front on the first edge
     speed_mps: float | None  # None: as fast as allowed
     like: str  # "avg": as the trains on its edge on average, "last": as the last of them, and at most as allowed; else ""
-    stops: tuple[Stop, ...]
+    stops: tuple[StopElement, ...]
     arrival_m: float | None  # where on the last edge it leaves; None: at its end
     line: str
 
 
-class Traffic(NamedTuple):
+class Configuration(NamedTuple):
     """The trains of a configuration."""
 
     net: Path
@@ -86,7 +86,7 @@ class Traffic(NamedTuple):
     notes: tuple[str, ...]  # what is not followed
 
 
-def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, seed: int = 42) -> Traffic:
+def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, seed: int = 42) -> Configuration:
     """What a SUMO configuration says of its trains.
 
     Parameters
@@ -129,29 +129,29 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
     begin, own_end = times["begin"], times["end"] if times["end"] >= 0 else None
     ends = [e for e in (own_end, None if duration_s is None else begin + duration_s) if e is not None]
     tracks = read_tracks(net[0])
-    demand = read_demand([*more, *routes])
+    elements = read_demand([*more, *routes])
     if options.get("use-stop-ended", "false").lower() in YES:
-        _ended(demand)
+        _ended(elements)
     wrong = [
         f"vType {name}: {key} = {element.get(key)}: must be a number, not negative"
-        for name, element in demand.types.items()
+        for name, element in elements.types.items()
         for key in ("length", "maxSpeed")
         if bad_number(element.get(key))
     ]
     if wrong:
         raise InputError(wrong)
-    kinds = {name: kind_of(element) for name, element in (default_types() | demand.types).items()}
-    trains, notes = rail_trains(demand, kinds)
-    more_notes, refused = not_followed(options, trains, demand, kinds, tracks.file)
+    kinds = {name: kind_of(element) for name, element in (default_types() | elements.types).items()}
+    trains, notes = rail_trains(elements, kinds)
+    more_notes, refused = not_followed(options, trains, elements, kinds, tracks.file)
     if refused:
         raise InputError([f"{sumocfg}: {line}" for line in refused])
-    refuse(sumocfg, net[0], trains, demand, kinds, tracks)
+    refuse(sumocfg, net[0], trains, elements, kinds, tracks)
     if float(scale) != 1.0:
         trains, scale_notes = scaled(trains, float(scale), options.get("scale-suffix", "."))
         notes += scale_notes
     if in_doubt(net[0], tracks.file):
         tried(net[0])
-    expanded = expand(trains, demand, net[0], work, begin, min(ends) if ends else None, seed)
+    expanded = expand(trains, elements, net[0], work, begin, min(ends) if ends else None, seed)
     order = {train.get("id", ""): k for k, train in enumerate(trains)}
     made = {vehicle.get("id", "") for vehicle in expanded}
     made |= {name.rpartition(".")[0] for name in made}
@@ -167,7 +167,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         kind = kinds[vehicle.get("type", "DEFAULT_VEHTYPE")]
         if kind.vclass not in RAIL:
             continue
-        train, mistakes = _departure(vehicle, source, kind, demand, tracks, speed)
+        train, mistakes = _departure(vehicle, source, kind, elements, tracks, speed)
         departures.append((order[source.get("id", "")], train))
         wrong += mistakes
     if wrong:
@@ -182,7 +182,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
             f"net: {len(plain)} x edges of routes let everybody on, no rail class by name: tracks without their road traffic"
         )
     notes += crossings.told(tracks.file, [d.edges for _, d in departures])
-    return Traffic(
+    return Configuration(
         net=net[0],
         departures=tuple(d for _, d in departures),
         kinds={name: kind for name, kind in kinds.items() if name in used},
@@ -207,9 +207,9 @@ def _comes(train: Element, begin: float, end: float) -> bool:
     return sure and begin <= seconds(train.get("begin", "0")) < min(end, seconds(train.get("end", "inf")))
 
 
-def _ended(demand: Demand) -> None:
+def _ended(elements: Elements) -> None:
     """Let trains stand until the time at which their stops are said to have ended, as SUMO does with ``use-stop-ended``."""
-    everything = [*demand.trains, *demand.routes.values(), *demand.drawn.values()]
+    everything = [*elements.trains, *elements.routes.values(), *elements.drawn.values()]
     for stop in (stop for element in everything for stop in element.iter("stop")):
         if (ended := stop.get("ended")) is not None and is_time(ended) and seconds(ended) >= 0:
             stop.set("until", ended)
@@ -243,21 +243,21 @@ def _cut(source: Element, edges: tuple[str, ...], laps: int) -> tuple[int, int] 
 
 
 def _departure(
-    vehicle: Element, source: Element, kind: Kind, demand: Demand, tracks: Tracks, default_speed: str
+    vehicle: Element, source: Element, kind: Kind, elements: Elements, tracks: Tracks, default_speed: str
 ) -> tuple[Departure, list[str]]:
     """A train out of what duarouter wrote and what the file said, and the mistakes in it."""
     name, route = vehicle.get("id", ""), vehicle.find("route")
     edges = () if route is None else tuple(route.get("edges", "").split())
-    edges, laps, of_lap = _lap(edges, routes_of(source, demand))
+    edges, laps, of_lap = _lap(edges, routes_of(source, elements))
     cut = _cut(source, edges, laps)
     first, end = (0, len(edges) * laps) if isinstance(cut, str) else cut
     firsts = [max(k // of_lap * len(edges) - first, 0) if k < laps * of_lap else 0 for k, _ in enumerate(vehicle.iter("stop"))]
     edges = (edges * laps)[first:end]
-    places = [place_of(stop, demand, tracks) for stop in vehicle.iter("stop")]
+    places = [place_of(stop, elements, tracks) for stop in vehicle.iter("stop")]
     wrong = [f"train {name}: {m}" for m in (*unconnected(list(edges), tracks), *off_route(edges, places, firsts))]
     wrong += [f"train {name}: {cut}"] if isinstance(cut, str) else []
     stops = [
-        Stop(
+        StopElement(
             edge=place.lane.rpartition("_")[0],
             position_m=place.position_m,
             duration_s=max(seconds(stop.get("duration", "0")), 0.0),

@@ -1,0 +1,201 @@
+"""What people see of runs whose trains come and go: figures, page, comparison, export, the picture over TraCI, the net."""
+
+from __future__ import annotations
+
+import base64
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+
+from trainctl.cli import program as cli
+from trainctl.errors import InputError
+from trainctl.figures import catalogue
+from trainctl.figures.trains import MARKS, drawable
+from trainctl.report.animation import animation
+from trainctl.report.page import page
+from trainctl.runner import run
+from trainctl.runs.known import facts
+from trainctl.runs.run import Run
+from trainctl.scenario.build import open_scenario
+from trainctl.sumo import gui
+from trainctl.sumo.replay import replay
+
+MERGING = Path(__file__).resolve().parents[3] / "scenarios"
+SETTINGS = {"run.duration_s": 720}
+
+
+@pytest.fixture(scope="module")
+def merging(tmp_path_factory):
+    """Up to the stop and beyond, under SUMO."""
+    return run(open_scenario("merging", SETTINGS), tmp_path_factory.mktemp("merging") / "sumo")
+
+
+@pytest.fixture(scope="module")
+def numeric(tmp_path_factory):
+    return run(open_scenario("merging", {"run.duration_s": 96}), tmp_path_factory.mktemp("merging") / "numeric", "numeric")
+
+
+def typed(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["trainctl", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 0, capsys.readouterr().err
+    return capsys.readouterr().out
+
+
+def test_there_is_no_common_reference_but_a_cruising_speed(merging):
+    known = facts(merging)
+    assert (known.traffic, known.reference, known.cruise_mps) == (True, None, 36.0)
+    assert not any(name.startswith("formation.final_speed") for name in merging.metrics)
+
+
+def test_no_line_where_a_train_is_not_there_and_marks_where_something_happened(merging):
+    axes = catalogue.figure(merging, "train_graph").axes
+    assert len(axes) == 1
+    first = merging.trains.astype({"train": str}).groupby("train")["time_s"].min()
+    colour = {name: to_hex(c) for name, c in drawable(merging).colour.items()}
+    marks = {mark: 0 for mark, _ in MARKS.values()}
+    for line in axes[0].lines:
+        if line.get_marker() in marks:
+            marks[line.get_marker()] += 1
+            continue
+        x, y = (np.asarray(v, float) for v in line.get_data())
+        (name,) = [name for name, c in colour.items() if c == to_hex(line.get_color())]
+        assert np.min(x[np.isfinite(y)], initial=np.inf) >= first[name]
+        assert line.get_linestyle() in ("-", ":")
+    happened = {mark: sum(e["kind"] == kind for e in merging.events) for kind, (mark, _) in MARKS.items()}
+    assert marks == happened
+    assert happened["^"] >= 3 and happened["s"] == 1 and happened["D"] >= 2
+
+
+def test_the_page_shows_the_net_as_it_lies(merging):
+    film = animation(drawable(merging))
+    frames, trains = len(film["time"]), len(film["trains"])
+    x, y, edge = (np.frombuffer(base64.b64decode(film[k]["bdata"]), "<f4") for k in ("position", "lateral", "edge"))
+    x, y, edge = (v.reshape(frames, trains) for v in (x, y, edge))
+    late = [t["name"] for t in film["trains"]].index("stopping")
+    assert np.isnan(x[0, late]) and np.isfinite(x[-1, late])
+    at = film["time"].index(next(e["time_s"] for e in merging.events if e["kind"] == "stop_reached"))
+    assert film["tracks"][int(edge[at, late])] == "trunk"
+    assert abs(x[at, late] - 15900.0) < 20.0 and abs(y[at, late] - 3400.0) < 20.0  # endPos 8900 m on trunk, which begins at 7 km
+    text = page(merging)
+    assert "On the net" in text and "There is no animation" not in text and "{{" not in text.partition("<script>")[0]
+
+
+def test_a_run_without_sumo_has_a_page_without_animation(numeric):
+    assert animation(drawable(numeric))["time"] == []
+    text = page(numeric)
+    assert "There is no animation: a run without SUMO" in text
+    assert "<div hidden>" in text
+
+
+def test_commands_work_on_such_runs(merging, numeric, tmp_path, monkeypatch, capsys):
+    for command in ("check merging", f"metrics {merging.folder}", f"metrics {merging.folder} --all --json"):
+        assert typed(monkeypatch, capsys, *command.split())
+    files = typed(monkeypatch, capsys, "plot", merging.folder, "--out", tmp_path / "figures").split()
+    assert {"train_graph.png", "fig3_positions.png", "fig4_spacing.png"} <= {name.rpartition("/")[2] for name in files}
+    assert "no difference" in typed(monkeypatch, capsys, "diff", merging.folder, merging.folder)
+    found = json.loads(typed(
+        monkeypatch, capsys, "compare", merging.folder, numeric.folder, "--out", tmp_path / "compare", "--json"
+    ))  # fmt: skip
+    assert len(found["figures"]) == 4
+    for form in ("csv", "mat"):
+        assert typed(monkeypatch, capsys, "export", merging.folder, "--format", form, "--out", tmp_path / form)
+    assert "in_formation" in (tmp_path / "csv" / "trains.csv").read_text().partition("\n")[0]
+
+
+def test_a_watched_run_is_the_same_run_and_dots_come_and_go(merging, tmp_path, monkeypatch):
+    told, added, removed = open_scenario("merging", {"run.duration_s": 240}), [], []
+    add, remove = gui.traci.polygon.add, gui.traci.polygon.remove
+    monkeypatch.setattr(gui.traci.polygon, "add", lambda name, *a, **k: (added.append(name), add(name, *a, **k)))
+    monkeypatch.setattr(gui.traci.polygon, "remove", lambda name: (removed.append(name), remove(name)))
+    watched = run(told, tmp_path / "watched", gui="sumo")
+    plain = run(told, tmp_path / "plain")
+    for name in ("trains", "links"):
+        assert (watched.folder / f"{name}.parquet").read_bytes() == (plain.folder / f"{name}.parquet").read_bytes()
+    assert {"dot_fast.0", "dot_stopping"} <= set(added)
+    assert any(name.startswith("link_") for name in added)
+
+
+def test_a_run_is_shown_again_as_sumo_had_it(merging, monkeypatch):
+    shown, read, names = {}, gui.Map.move, gui.Map.linked
+
+    def move(self, *a):
+        read(self, *a)
+        for i in np.flatnonzero(self.seen.present).tolist():
+            shown[round(100.0 + self._time(), 3), self.ids[i]] = self.line.edges[self.seen.edge[i]]
+
+    formations = []
+    monkeypatch.setattr(gui.Map, "move", move)
+    monkeypatch.setattr(gui.Map, "linked", lambda self, links, f: (formations.append(f.copy()), names(self, links, f)))
+    assert replay(merging, "sumo", from_s=100.0) == 620
+    rows = merging.trains[merging.trains["time_s"] > 100.0]
+    recorded = {(round(t, 3), str(n)): str(e) for t, n, e in zip(rows["time_s"], rows["train"], rows["edge"], strict=True)}
+    assert {k: v for k, v in shown.items() if k in recorded} == recorded
+    assert max(np.bincount(f).max() for f in formations) >= 2, "a formation is coloured as one"
+
+
+def test_a_run_without_sumo_is_not_shown_again(numeric):
+    with pytest.raises(Exception, match="made without SUMO, which alone knows where its net lies"):
+        replay(numeric, "sumo")
+
+
+def test_an_fcd_log_with_gaps_is_not_replayed(tmp_path):
+    thinned = run(open_scenario("merging", {"run.duration_s": 96, "run.record_every_s": 8}), tmp_path / "r")
+    with pytest.raises(
+        InputError, match=r"run.record_every_s = 8: trains that come and go are replayed from an FCD log of every step"
+    ):
+        replay(thinned, "sumo")
+
+
+def test_what_is_said_before_and_after_a_run(tmp_path, monkeypatch, capsys):
+    found = json.loads(typed(monkeypatch, capsys, "check", "merging", "--json"))
+    assert found["net"] == "6 rail edges, 46.6707 km"
+    assert (found["cooperate"], found["stops"]) == ("all", 1)
+    assert "links_at_start" not in found and found["supervisor"].startswith("on, ")
+    (tmp_path / "merging").mkdir()
+    for path in MERGING.glob("merging/*"):
+        text = path.read_text().replace("</routes>", '<person id="p" depart="0"><walk edges="trunk"/></person></routes>')
+        (tmp_path / "merging" / path.name).write_text(text)
+    (tmp_path / "s.toml").write_text((MERGING / "merging.toml").read_text())
+    monkeypatch.chdir(tmp_path)
+    for command in (("check", "s.toml"), ("run", "s.toml", "--backend", "numeric", "--set", "run.duration_s=16")):
+        assert "warning: 1 definitions of persons left out" in typed(monkeypatch, capsys, *command)
+
+
+def test_formations_named_are_of_trains_that_are_there(numeric):
+    at_start = next(e for e in numeric.events if e["kind"] == "topology")
+    assert at_start["formations"] == [["fast.0"]]
+
+
+def test_any_rail_net_is_drawn(merging, tmp_path, monkeypatch, capsys):
+    net = next((merging.folder / "sumo").glob("*.net.xml"))
+    typed(monkeypatch, capsys, "net", "show", net, "--out", tmp_path / "net.png")
+    assert (tmp_path / "net.png").stat().st_size > 5000
+    monkeypatch.setattr(sys, "argv", ["trainctl", "net", "show", str(net), "--from-m", "100"])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 2
+    assert "has no kilometrage" in capsys.readouterr().err
+
+
+def test_tables_of_such_runs_name_trains_only_while_they_are_there(numeric):
+    again = Run(numeric.folder)
+    assert again.trains["in_formation"].isin((0.0, 1.0)).all()
+    assert set(again.trains["train"].astype(str)) < {t["id"] for t in again.scenario["train"]}
+
+
+@pytest.mark.parametrize("place", [120, 400, 1200])
+def test_a_station_near_the_entry_is_not_overrun(tmp_path, place):
+    (tmp_path / "merging").mkdir()
+    for path in MERGING.glob("merging/*"):
+        text = path.read_text().replace('edge="trunk" endPos="8900"', f'edge="from_west" endPos="{place}"')
+        (tmp_path / "merging" / path.name).write_text(text.replace('depart="165"', 'depart="2"'))
+    (tmp_path / "s.toml").write_text((MERGING / "merging.toml").read_text())
+    done = run(open_scenario(str(tmp_path / "s.toml"), {"run.duration_s": 160}), tmp_path / "r", "numeric")
+    (stop,) = [e for e in done.events if e["kind"] == "stop_reached"]
+    assert (stop["train"], abs(stop["short_m"]) < 2.0) == ("stopping", True)

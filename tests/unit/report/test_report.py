@@ -1,0 +1,150 @@
+"""The page of a run without a browser: complete, offline, no extreme lost, event times exact."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+
+import numpy as np
+import pytest
+
+from trainctl.errors import InputError
+from trainctl.figures.trains import drawable
+from trainctl.record.recorder import Recorder, standard_tables
+from trainctl.report.animation import animation, frames
+from trainctl.report.page import page, report
+from trainctl.report.panels import panels, told
+from trainctl.runs.run import Run
+
+
+def unpacked(packed):
+    return np.frombuffer(base64.b64decode(packed["bdata"]), "<f4")
+
+
+def data_of(text):
+    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S).group(1))
+
+
+@pytest.fixture(scope="module")
+def run(finished):
+    return finished("three_tracks", "numeric", **{"run.duration_s": 1100})
+
+
+@pytest.fixture(scope="module")
+def text(run):
+    return page(run)
+
+
+def test_page_is_one_file_that_asks_for_nothing(run, text):
+    outside = re.sub(r"<script>.*?</script>", "", text, flags=re.S)  # the plotting library names addresses it never uses offline
+    assert re.findall(r'(?:src|href)="([^"#]*)', outside) == ["data:,", ""]  # an empty icon, a place on this page
+    assert "url(" not in outside
+    assert "default-src 'none'" in outside
+    assert report(run).read_text(encoding="utf-8") == text
+    assert len(text) < 10e6
+
+
+def test_every_panel_is_there_with_its_bounds(run, text):
+    shown = {panel["id"]: panel for panel in data_of(text)["panels"]}
+    wanted = {"graph", "relative", "speeds", "spacing", "errors", "inputs", "forces", "couplers", "energy", "events"}
+    assert wanted <= set(shown)
+    assert [b["value"] for b in shown["speeds"]["bounds"]] == [79.0, 85.0]
+    assert [b["value"] for b in shown["forces"]["bounds"]] == [-64.0, 40.0]
+    assert {b["dash"] for b in shown["spacing"]["bounds"]} == {"dash", "dot"}
+    assert all("[" in panel["unit"] for name, panel in shown.items() if name != "events")
+
+
+def test_no_extreme_of_any_speed_is_lost(run, text):
+    (speeds,) = [panel for panel in data_of(text)["panels"] if panel["id"] == "speeds"]
+    by_train = run.trains.groupby(run.trains.train.astype(str)).speed_mps
+    for trace in speeds["traces"]:
+        if trace["name"].startswith("train"):
+            y = unpacked(trace["y"])
+            name = trace["name"].split()[1]
+            assert y.max() == np.float32(by_train.max()[name])
+            assert y.min() == np.float32(by_train.min()[name])
+
+
+def test_frames_hold_every_event_and_the_instants_around_it():
+    instants = np.arange(0.0, 100_000.0)
+    kept = frames(instants, [0.0, 12_345.0, 99_999.0], 50)
+    assert {0.0, 12_344.0, 12_345.0, 12_346.0, 99_999.0} <= set(kept)
+    assert len(kept) < 5100
+    assert np.all(np.diff(kept) > 0)
+
+
+def test_trains_2_and_5_change_tracks_and_the_links_are_redrawn_at_1001(run):
+    film = animation(drawable(run))
+    names, time = [t["name"] for t in film["trains"]], np.array(film["time"])
+    lateral = unpacked(film["lateral"]).reshape(len(time), -1)
+    assert film["tracks"] == ["2", "1", "3"]  # from left to right in the running direction
+    before, after, past = (int(np.flatnonzero(time == t)[0]) for t in (1000.0, 1001.0, 1020.0))
+    two, five = names.index("2"), names.index("5")
+    assert (lateral[before, two], lateral[before, five]) == (1.0, 0.0)
+    assert 1.0 < lateral[after, two] < 2.0
+    assert 0.0 < lateral[after, five] < 1.0
+    assert (lateral[past, two], lateral[past, five]) == (2.0, 1.0)
+    links = np.frombuffer(base64.b64decode(film["links"]), np.uint8).reshape(len(time), -1)
+
+    def heard(frame):
+        return {frozenset((names[a], names[b])) for (a, b), state in zip(film["pairs"], links[frame], strict=True) if state == 2}
+
+    assert heard(before) == {frozenset(pair) for pair in ("12", "23", "34", "46")}
+    assert heard(after) == {frozenset(pair) for pair in ("13", "34", "45", "56")}
+
+
+def test_verdict_says_what_broke_first_and_where(finished, text):
+    assert "All bounds held" in text
+    violated = page(finished("fully_distributed_ratchet", "numeric", **{"run.duration_s": 1010}))
+    assert re.search(
+        r"1 of \d kinds of bound violated.</strong> First at 989 s: lower spacing bound \[m\] of link of 4-5", violated
+    )
+    assert '<td>4-5</td><td class="broken">violated</td>' in violated
+
+
+def test_lost_messages_are_told_from_missing_links(finished):
+    film = animation(drawable(finished("fully_distributed_loss", "numeric", **{"run.duration_s": 60})))
+    assert set(base64.b64decode(film["links"])) == {1, 2}
+
+
+def made_up(folder, trains, steps, title="made up"):
+    folder.mkdir()
+    ids = [f"t{k}" for k in range(trains)]
+    with Recorder(folder, standard_tables(ids, ["1"], ["e"], units=False)) as recorder:
+        for k in range(steps):
+            x = 80.0 * k - 5000.0 * np.arange(trains)
+            recorder.write(
+                "trains", time_s=float(k), train=np.arange(trains), track=np.zeros(trains, int), edge=np.zeros(trains, int), position_m=x,
+                speed_mps=80.0 + np.sin(k / 7 + np.arange(trains)), input_mps2=np.zeros(trains), spacing_m=np.full(trains, np.nan),
+                gap_m=np.full(trains, np.nan), saturated=np.zeros(trains, bool),
+            )  # fmt: skip
+        recorder.event(0.0, "note", text=title)
+    (folder / "run.json").write_text(json.dumps({"format": "trainctl run", "schema_version": 1, "status": "complete"}))
+    return Run(folder)
+
+
+def test_a_million_rows_make_a_small_page(tmp_path):
+    run = made_up(tmp_path / "run", 250, 4000)
+    assert sum(len(panel["traces"]) for panel in panels(drawable(run))) > 700
+    text = page(run)
+    assert len(text) < 10e6
+    (speeds,) = [panel for panel in data_of(text)["panels"] if panel["id"] == "speeds"]
+    assert sum(len(unpacked(trace["x"])) for trace in speeds["traces"]) < 80_000
+
+
+def test_names_cannot_break_out_of_the_page(tmp_path):
+    text = page(made_up(tmp_path / "run", 1, 3, title="</script><b>&\u2028"))
+    assert "</script><b>" not in text
+    assert data_of(text)["animation"]["events"][0]["text"] == "text </script><b>&\u2028"
+
+
+def test_an_event_is_one_line():
+    event = {"time_s": 1.0, "kind": "topology", "edges": [["1", "3"]], "formations": [["1", "3"], ["2"]], "start_condition": []}
+    assert told(event) == "edges 1-3, formations 1 3 | 2"
+
+
+def test_a_run_without_trains_or_a_wrong_place_is_told(tmp_path):
+    run = made_up(tmp_path / "run", 1, 3)
+    with pytest.raises(InputError, match="cannot be written"):
+        report(run, tmp_path / "nowhere" / "page.html")

@@ -1,0 +1,195 @@
+"""What a sweep runs, what it keeps, and what it says of it; no cluster, no SUMO."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from trainctl.errors import InputError, LawError
+from trainctl.studies import sweep as sweeping
+from trainctl.studies.results import shares, wilson
+from trainctl.studies.sweep import SweepPlan, half_width, job_model, jobs, seeds, sweep, values
+
+SHORT = {"run.duration_s": [20]}
+
+
+@pytest.fixture
+def alone(monkeypatch):
+    """The cluster is this process; the last job comes first."""
+    asked = []
+
+    def here(todo, workers, scheduler):
+        asked.append([job.number for job in todo])
+        yield from map(sweeping.simulate, reversed(todo))
+
+    monkeypatch.setattr(sweeping, "_scattered", here)
+    return asked
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "found"),
+    [
+        ("topology.loss=0,0.1", "topology.loss", [0, 0.1]),
+        ("controller.eta=printed,own_speed", "controller.eta", ["printed", "own_speed"]),
+        ("reference.table=[[0, 80.0], [10, 75.0]]", "reference.table", [[[0, 80.0], [10, 75.0]]]),
+        ('disturbance=[], [{on = "input"}]', "disturbance", [[], [{"on": "input"}]]),
+    ],
+)
+def test_values_are_toml_or_bare_words(text, key, found):
+    assert values(text) == (key, found)
+
+
+def test_seeds_are_ranges_and_numbers():
+    assert seeds("0..3") == [0, 1, 2, 3]
+    assert seeds("1,2,5..7,2") == [1, 2, 5, 6, 7]
+    for wrong in ("a", "3..1", "-1", "1..", ""):
+        with pytest.raises(InputError, match="--seeds"):
+            seeds(wrong)
+
+
+def test_jitter_needs_a_key_of_trains_and_a_width():
+    assert half_width("train.position_m=500") == ("train.position_m", 500.0)
+    for wrong in ("position_m=5", "train.position_m", "train.position_m=x", "train.position_m=-1", "train.position_m=inf"):
+        with pytest.raises(InputError, match="--jitter"):
+            half_width(wrong)
+
+
+def test_every_setting_meets_every_other_and_every_seed():
+    plan = SweepPlan("fully_distributed", {"topology.loss": [0.0, 0.1], "run.duration_s": [10, 20]}, [1, 2, 3], {})
+    found = plan.combinations()
+    assert len(found) == 12
+    assert len({json.dumps(c) for c in found}) == 12
+    assert found[0] == {"topology.loss": 0.0, "run.duration_s": 10, "run.seed": 1}
+
+
+@pytest.mark.parametrize(
+    ("plan", "words"),
+    [
+        (SweepPlan("fully_distributed", {"topology.los": [0]}, [0], {}), "topology.los: unknown key; did you mean loss"),
+        (SweepPlan("fully_distributed", {"controller.etta": ["printed"]}, [0], {}), "controller.etta: unknown key"),
+        (SweepPlan("fully_distributed", {"topology.loss": [0.0, 2.0]}, [0], {}), "topology.loss = 2.0"),
+        (SweepPlan("fully_distributed", {}, [], {"train.position_m": 1.0}), "needs --seeds"),
+        (SweepPlan("fully_distributed", {}, [0], {"train.speed_upper_mps": 1.0}), "not every"),
+        (SweepPlan("no_such", {}, [0], {}), "no such scenario"),
+    ],
+)
+def test_mistakes_are_told_before_anything_runs(plan, words):
+    with pytest.raises(InputError, match=words):
+        jobs(plan)
+
+
+def test_one_start_that_is_refused_does_not_stop_the_others():
+    plan = SweepPlan("fully_distributed", {"bounds.speed_upper_mps": [70.0, 85.0]}, [], {})
+    assert len(jobs(plan)) == 2
+    with pytest.raises(InputError, match=r"speed bounds 75 \.\. 70 are empty"):
+        jobs(SweepPlan("fully_distributed", {"bounds.speed_upper_mps": [70.0]}, [], {}))
+
+
+def test_jitter_depends_on_seed_and_key_alone():
+    def starts(seed, **jitter):
+        plan = SweepPlan("monte_carlo_start", {}, [seed], {f"train.{k}": w for k, w in jitter.items()})
+        plan = SweepPlan(str(sweeping.sweeps()["monte_carlo_start"]), plan.settings, plan.seeds, plan.jitter)
+        return job_model(jobs(plan)[0]).own
+
+    rest, moved, both = starts(1), starts(1, position_m=500.0), starts(1, position_m=500.0, speed_mps=4.0)
+    deviation = moved[:, 0] - rest[:, 0]
+    assert np.all(np.abs(deviation) <= 500.0)
+    assert len(np.unique(deviation)) == len(deviation)
+    assert np.array_equal(moved[:, 0], both[:, 0])
+    assert np.array_equal(moved[:, 1], rest[:, 1])
+    assert not np.array_equal(moved[:, 0], starts(2, position_m=500.0)[:, 0])
+
+
+def test_wilson_interval_against_published_numbers():
+    # Newcombe (1998), Statistics in Medicine 17:857, Table I, method 3
+    for hits, total, low, high in (
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ):
+        assert wilson(hits, total) == pytest.approx((low, high), abs=5e-5)
+    assert wilson(29, 29) == (pytest.approx(1 - wilson(0, 29)[1]), 1.0)
+    assert wilson(0, 0) is None
+
+
+def test_rows_come_in_the_order_of_the_plan_whoever_was_first(alone, tmp_path):
+    plan = SweepPlan("fully_distributed", {**SHORT, "topology.loss": [0.0, 0.2]}, [0, 1], {}, "numeric")
+    info = sweep(plan, tmp_path / "a")
+    assert (info["status"], info["complete"], info["failed"], info["refused"]) == ("complete", 4, 0, 0)
+    table = pd.read_parquet(tmp_path / "a" / "results.parquet")
+    assert table["run"].tolist() == [0, 1, 2, 3]
+    assert table["topology.loss"].tolist() == [0.0, 0.0, 0.2, 0.2]
+    assert table["run.seed"].tolist() == [0, 1, 0, 1]
+    assert table["bounds.speed_upper_margin_mps"].notna().all()
+    assert (tmp_path / "a" / "summary.png").stat().st_size > 5000
+    assert not list((tmp_path / "a").glob("runs"))
+
+
+def test_one_failure_is_recorded_and_the_rest_goes_on(alone, tmp_path, monkeypatch):
+    from trainctl import runner
+
+    whole = runner.run
+
+    def fails_once(p, folder, *more):
+        if p.scenario.run.seed == 1:
+            raise LawError(f"diverged in {folder}")
+        return whole(p, folder, *more)
+
+    monkeypatch.setattr(runner, "run", fails_once)
+    plan = SweepPlan("fully_distributed", SHORT, [0, 1, 2], {}, "numeric")
+    info = sweep(plan, tmp_path / "a")
+    assert (info["complete"], info["failed"]) == (2, 1)
+    assert info["reasons"] == ["run 1 failed: diverged in 000001"]  # no scratch folder in the dataset
+    table = pd.read_parquet(tmp_path / "a" / "results.parquet")
+    assert table["status"].tolist() == ["complete", "failed", "complete"]
+
+    monkeypatch.setattr(runner, "run", whole)
+    info = sweep(plan, tmp_path / "a", resume=True)
+    assert info["complete"] == 3
+    assert alone == [[0, 1, 2], [1]]  # only what failed was done again
+
+
+def test_resume_skips_what_is_done_and_survives_a_cut_line(alone, tmp_path):
+    plan = SweepPlan("fully_distributed", SHORT, [0, 1, 2], {}, "numeric")
+    out = tmp_path / "a"
+    sweep(plan, out)
+    whole = (out / "results.parquet").read_bytes()
+    lines = (out / "rows.jsonl").read_text().splitlines()
+    (out / "rows.jsonl").write_text(lines[0] + "\n" + lines[1][:40])
+    sweep(plan, out, resume=True)
+    assert alone[1] == [0, 1]  # run 2 came first and was kept
+    assert (out / "results.parquet").read_bytes() == whole
+
+
+def test_resume_refuses_another_sweep_and_nothing_is_replaced_unasked(alone, tmp_path):
+    out = tmp_path / "a"
+    sweep(SweepPlan("fully_distributed", SHORT, [0], {}, "numeric"), out)
+    with pytest.raises(InputError, match="--resume: its scenario"):
+        sweep(SweepPlan("fully_distributed_loss", SHORT, [0], {}, "numeric"), out, resume=True)
+    with pytest.raises(InputError, match="--force replaces it"):
+        sweep(SweepPlan("fully_distributed", SHORT, [0], {}, "numeric"), out)
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "thesis.tex").touch()
+    with pytest.raises(InputError, match="not a sweep"):
+        sweep(SweepPlan("fully_distributed", SHORT, [0], {}, "numeric"), tmp_path / "b", resume=True)
+    assert (tmp_path / "b" / "thesis.tex").exists()
+
+
+def test_the_ready_made_sweep_is_found_and_its_starts_are_sound():
+    plan = sweeping.ready_made("monte_carlo")
+    assert plan is not None
+    assert len(plan.seeds) == 100
+    for job in [j for j in jobs(plan) if j.parameters["topology.loss"] == 0.0]:
+        job_model(job)  # raises if a start condition fails
+    assert sweeping.ready_made("fully_distributed") is None
+
+
+def test_shares_are_told_per_combination(alone, tmp_path):
+    plan = SweepPlan("fully_distributed", {**SHORT, "bounds.speed_upper_mps": [85.0, 85.5]}, [0, 1], {}, "numeric")
+    sweep(plan, tmp_path / "a")
+    rows = shares(tmp_path / "a", ["bounds.speed_upper_mps"])
+    assert [(r["values"], r["runs"], r["of"]) for r in rows] == [((85.0,), 0, 2), ((85.5,), 0, 2)]

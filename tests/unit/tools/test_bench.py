@@ -1,0 +1,118 @@
+"""The bench runs every case, tells what it says, and its cases are what they claim to be."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import trainctl
+
+FILE = Path(__file__).resolve().parents[3] / "tools" / "bench.py"
+spec = importlib.util.spec_from_file_location("bench", FILE)
+bench = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(bench)
+
+
+@pytest.mark.parametrize("case", sorted({*bench.IN_SUMO, *bench.NUMERIC} - {"traffic"}))
+def test_scenarios_have_the_trains_they_say_on_edges_of_5_km(case):
+    text, line = bench.scenario(case, 100, 50)
+    data, net = tomllib.loads(text), tomllib.loads(line)
+    assert len(data["train"]) == 100
+    assert {t["track"] for t in data["train"]} == {1, 2, 3}
+    assert net["max_edge_m"] == 5000.0
+    assert max(t["position_m"] for t in data["train"]) + 50 * 90 < net["length_m"]
+
+
+def test_trains_of_the_traffic_case_come_merge_and_couple(tmp_path):
+    text, _ = bench.scenario("traffic", 11, 300)
+    (tmp_path / "scenario.toml").write_text(text)
+    bench.railway(tmp_path, 11)
+    run = trainctl.run(tmp_path / "scenario.toml", backend="numeric", out=tmp_path / "run")
+    came = {e["train"]: e["time_s"] for e in run.events if e["kind"] == "depart"}
+    assert sorted(came, key=int) == [str(k) for k in range(11)]
+    assert max(came.values()) <= bench.BEFORE["traffic"]
+    pairs = {(int(e["train"]), int(e["ahead"])) for e in run.events if e["kind"] == "couple"}
+    assert any((a - b) % 2 for a, b in pairs) and all(a // bench.PER_PIECE == b // bench.PER_PIECE for a, b in pairs)
+
+
+def test_ratios_are_those_within_a_pair():
+    def result(seconds):
+        return {"steps": 10, "seconds": seconds, "cpu": 2.0 * seconds}
+
+    pairs = [{"here": result(a), "there": result(b)} for a, b in ((2.0, 1.0), (3.0, 4.0), (8.0, 10.0))]
+    row = bench.paired("loop", 1000, pairs)
+    assert (row["ratio"], row["least_ratio"], row["greatest_ratio"], row["cpu_ratio"]) == (0.8, 0.75, 2.0, 0.8)
+    assert (row["here_us"], row["there_us"]) == (300.0, 400.0)
+
+
+def test_two_checkouts_are_compared_each_with_its_own_code(tmp_path):
+    here = FILE.parents[1]
+    command = [sys.executable, FILE, "--trains", "6", "--only", "supervised", "--repeats", "1", "--json", "--against"]
+    done = subprocess.run([*command, here], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    [row] = json.loads(done.stdout)
+    assert (row["case"], row["trains"], row["pairs"]) == ("supervised", 6, 1)
+    assert 0.2 < row["ratio"] < 5.0
+    (tmp_path / "trainctl").mkdir()  # another trainctl: it has no Simulation
+    (tmp_path / "trainctl" / "__init__.py").touch()
+    done = subprocess.run([*command, tmp_path], capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "has no attribute 'Simulation'" in done.stderr
+
+
+def test_time_inside_a_part_is_not_that_of_the_part_around_it(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(bench.time, "perf_counter", lambda: now[0])
+    clock = bench.Clock()
+    with clock.part("write"):
+        now[0] += 1.0
+        with clock.part("step"):
+            now[0] += 10.0
+        with clock.part("read"):
+            now[0] += 100.0
+        now[0] += 1000.0
+    now[0] += 10_000.0
+    assert (clock.spent["write"], clock.spent["step"], clock.spent["read"]) == (1001.0, 10.0, 100.0)
+
+
+def test_rows_are_medians_per_train_and_step_and_of_ratios_within_a_repeat():
+    def result(seconds):
+        return {"steps": 10, "seconds": seconds, "cpu": seconds, "parts": {"step": seconds / 2}, "peak_mb": seconds}
+
+    repeats = [{"loop": result(loop), "bare": result(bare)} for loop, bare in ((3.0, 2.0), (1.0, 0.8), (2.0, 0.5))]
+    row = bench.row("loop", 100, repeats)
+    assert row["us_per_train_step"] == pytest.approx(2000.0)
+    assert (row["step_us"], row["read_us"], row["peak_mb"]) == (pytest.approx(1000.0), 0.0, 3.0)
+    assert row["times_real_time"] == pytest.approx(5.0)
+    assert row["ratio_to_bare"] == row["cpu_ratio_to_bare"] == 1.5
+    assert bench.row("loop", 100, [{"loop": result(1.0)}])["ratio_to_bare"] is None
+
+
+def test_one_command_measures_side_by_side():
+    command = [sys.executable, FILE, "--trains", "6", "--only", "bare", "--only", "loop", "--repeats", "1", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    rows = {row["case"]: row for row in json.loads(done.stdout)}
+    assert rows["bare"]["ratio_to_bare"] == 1.0
+    assert rows["loop"]["ratio_to_bare"] == pytest.approx(
+        rows["loop"]["us_per_train_step"] / rows["bare"]["us_per_train_step"], rel=1e-2
+    )
+    parts = sum(rows["loop"][f"{part}_us"] for part in bench.PARTS)
+    assert 0.5 * rows["loop"]["us_per_train_step"] < parts <= 1.01 * rows["loop"]["us_per_train_step"]
+    assert all(row["peak_mb"] > 10 for row in rows.values())
+
+
+def test_reading_logs_is_measured_beside_the_bare_parser():
+    command = [sys.executable, FILE, "--logs", "0.5", "--repeats", "1", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    rows = {row["case"]: row for row in json.loads(done.stdout)}
+    assert list(rows) == ["regular", "few", "persons", "irregular", "strict", "one_line", "diff"]
+    assert all(row["ratio_to_bare"] > 0.0 for name, row in rows.items() if name != "diff")
+    assert rows["diff"]["mb"] == pytest.approx(2 * rows["regular"]["mb"], rel=0.1)
