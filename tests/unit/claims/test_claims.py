@@ -123,7 +123,7 @@ def check_page(claims):
         for old, new in zip(pages[paper], measured, strict=True):
             known, found = (np.array(re.findall(r"-?\d+(?:\.\d+)?(?:e[+-]\d+)?", row[2]), float) for row in (old, new))
             assert len(known) == len(found), hint
-            kept = (np.abs(found) > 1e-4) & (np.abs(found) < 1e8)
+            kept = (np.abs(found) > 1e-4) & (np.abs(found) < 1e6)
             np.testing.assert_allclose(known[kept], found[kept], rtol=0.01, err_msg=f"{new[0]}: {hint}")
 
 
