@@ -36,6 +36,7 @@ from trainctl.record.folder import (
     remove,
     write_info,
     write_json,
+    written,
 )  # fmt: skip
 from trainctl.runs.run import Run
 from trainctl.scenario import promise, roster
@@ -271,7 +272,8 @@ def _complete(p: Model, partial: Path, info: dict[str, Any], done: dict[str, Any
     if journal is None:
         Journal(partial, p, done["recorder"]).close()
     write_json(partial / "metrics.json", metrics(Run(partial)))
-    write_info(partial, {**info, **done["end"], "status": "complete", "wall_time_s": done["wall_time_s"]})
+    files = [path for path in written(partial) if not path.startswith(f"{checkpoint.FOLDER}/")]
+    write_info(partial, {**info, **done["end"], "status": "complete", "wall_time_s": done["wall_time_s"], "files": files})
     remove(partial / checkpoint.FOLDER)
 
 

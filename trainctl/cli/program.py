@@ -19,9 +19,12 @@ from trainctl.cli.console import (
     ScenarioName,
     Settings,
     app,
+    fill,
     listing,
     named,
     networks,
+    number,
+    say,
     show,
     show_json,
 )
@@ -35,7 +38,13 @@ if TYPE_CHECKING:
 @app.command()
 def run(
     name: ScenarioName = DEFAULT_SCENARIO,
-    out: Annotated[Path | None, typer.Option(help="Run folder; default runs/NAME. A run of ours there is replaced.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Run folder; default runs/NAME, with --set runs/NAME,KEY=VALUE. A run there is replaced, unless more than a run"
+            " lies there: then it goes to NAME-2."
+        ),
+    ] = None,
     backend: Annotated[Literal["sumo", "numeric"], typer.Option(help="SUMO, or the same loop without a simulator.")] = "sumo",
     gui: Annotated[bool, typer.Option("--gui", help="Watch the run in sumo-gui: tracks, trains by role, links.")] = False,
     gui_program: Annotated[str, typer.Option(help="The program --gui starts; sumo is the same without a window.")] = "sumo-gui",
@@ -57,13 +66,16 @@ def run(
     Exit 1 if trains collided or waited for each other in a circle; with the supervisor on also if one was too fast for its line.
     """
     from trainctl import runner
+    from trainctl.record.folder import place_for, run_name
 
     if gui and backend == "numeric":
         raise InputError("--gui: shows SUMO; leave out --backend numeric")
     if record_every is not None:
         settings = [*(settings or []), f"run.record_every_s={record_every!r}"]
     model = named(name, settings)
-    folder = out if out is not None else Path("runs") / Path(name).stem
+    folder, elsewhere = (out, "") if out is not None else place_for(Path("runs") / run_name(name, settings or []))
+    if elsewhere:
+        say(elsewhere, error=True)
     shown = not (quiet or as_json)
     with Progress(f"{Path(name).stem}", shown and sys.stderr.isatty()) as advance:
         done = runner.run(model, folder, backend, force, sys.argv, advance, gui_program if gui else None, checkpoint_every)
@@ -80,14 +92,14 @@ def _summary(done: Run, model: Model) -> None:
     from trainctl.runs.outcome import summary
 
     info, metrics = done.info, done.metrics
-    print(model.scenario.title)
+    say(model.scenario.title)
     table = listing(None, "", "")
     table.show_header = False
     law = model.scenario.controller.law
-    table.add_row(
-        "law, plant", f"{law} on {model.scenario.plant.kind}, {len(model.scenario.train)} trains, backend {info['backend']}"
+    fill(
+        table, "law, plant", f"{law} on {model.scenario.plant.kind}, {len(model.scenario.train)} trains, backend {info['backend']}"
     )
-    table.add_row("steps", f"{info['steps']} of {model.scenario.run.step_s:g} s in {info['wall_time_s']:.1f} s")
+    fill(table, "steps", f"{info['steps']} of {model.scenario.run.step_s:g} s in {info['wall_time_s']:.1f} s")
     for key, words, unit in (
         ("bounds.spacing_lower_margin_m", "minimum spacing above its lower bound", "m"),
         ("bounds.spacing_upper_margin_m", "minimum room below the upper spacing bound", "m"),
@@ -99,13 +111,13 @@ def _summary(done: Run, model: Model) -> None:
         ("formation.final_error_m", "largest spacing error at the end", "m"),
     ):
         if isinstance(metrics.get(key), int | float):
-            table.add_row(words, f"{metrics[key]:.6g} {unit}")
+            fill(table, words, f"{number(metrics[key])} {unit}")
     for line in summary(done):
-        table.add_row(line.title, f"FAILED: {line.text}" if line.failed else line.text)
-    table.add_row("results", f"{done.folder}/  (trainctl plot {done.folder}; trainctl metrics {done.folder})")
+        fill(table, line.title, f"FAILED: {line.text}" if line.failed else line.text)
     show(table)
+    say(f"  results in {done.folder}/\n  trainctl plot {done.folder}\n  trainctl metrics {done.folder}\n")
     for note in model.roster.notes:
-        print(f"warning: {note}")
+        say(f"warning: {note}")
 
 
 @app.command("list")
@@ -122,7 +134,7 @@ def list_(as_json: Json = False) -> None:
         return
     table = listing(None, "name", "law", "title")
     for row in rows:
-        table.add_row(row["name"], row["law"], row["title"])
+        fill(table, row["name"], row["law"], row["title"])
     show(table)
 
 
@@ -136,19 +148,19 @@ def check(name: ScenarioName = DEFAULT_SCENARIO, settings: Settings = None, as_j
     if as_json:
         show_json(found)
         return
-    print(f"{model.file}: no mistakes, no start condition of {model.scenario.controller.law} violated")
+    say(f"{model.file}: no mistakes, no start condition of {model.scenario.controller.law} violated")
     table = listing(None, "", "")
     table.show_header = False
     for key, value in found.items():
         if key not in ("warnings", "report", "analysis", "protection", "promise"):
-            table.add_row(key, str(value))
+            fill(table, key, str(value))
     show(table)
     for k, line in enumerate(found.get("promise", ())):
-        print(f"protection: {line}" if not k else f"  - {line}")
+        say(f"protection: {line}" if not k else f"  - {line}")
     for line in found["report"]:
-        print(line)
+        say(line)
     for line in found["warnings"]:
-        print(f"warning: {line}")
+        say(f"warning: {line}")
 
 
 @app.command()
@@ -159,6 +171,7 @@ def metrics(
     band_m: Annotated[float, typer.Option(help="Band for settling of spacings [m].")] = 1.0,
     section_m: Annotated[float | None, typer.Option(help="Kilometrage at which trains are counted [m].")] = None,
     everything: Annotated[bool, typer.Option("--all", help="Also the values of each train, link and unit.")] = False,
+    only: Annotated[str | None, typer.Option(help="Only metrics whose names begin like this: bounds, energy, traffic.gap.")] = None,
     names: Annotated[bool, typer.Option("--list", help="List all metrics with units and definitions.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -171,7 +184,7 @@ def metrics(
             return
         table = listing(None, "metric", "unit", "definition")
         for key, (unit, text) in measured.DEFINITIONS.items():
-            table.add_row(key, unit, text)
+            fill(table, key, unit, text)
         show(table)
         return
     if folder is None:
@@ -184,14 +197,24 @@ def metrics(
         from trainctl.metrics.traffic import metrics_of_fcd
 
         values = metrics_of_fcd(folder)
+    if only is not None:
+        kept = {key: value for key, value in values.items() if key.startswith(only)}
+        if not kept:
+            groups = dict.fromkeys(key.partition(".")[0] for key in values)
+            raise InputError(f"--only {only}: no metric begins like this; there are: {', '.join(groups)}")
+        values = kept
     if as_json:
         show_json(values)
         return
     table = listing(str(folder), "metric", "value", "unit")
+    group = ""
     for key, value in values.items():
         if everything or "/" not in key:
+            if group and group != key.partition(".")[0]:
+                table.add_section()
+            group = key.partition(".")[0]
             unit = measured.DEFINITIONS.get(key.partition("/")[0], ("", ""))[0]
-            table.add_row(key, f"{value:.6g}" if isinstance(value, float) else str(value), unit)
+            fill(table, key, number(value), unit)
     show(table)
 
 
@@ -211,7 +234,7 @@ def plot(
     if wrong:
         raise InputError([f"--format {f}: must be one of png, svg, pdf" for f in wrong])
     for path in draw(Run(folder), out or folder / "figures", wanted, width):
-        print(path)
+        say(path)
 
 
 @app.command()
@@ -234,7 +257,7 @@ def _version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
-        print(f"trainctl {version('trainctl')}, SUMO {version('libsumo')}")
+        say(f"trainctl {version('trainctl')}, SUMO {version('libsumo')}")
         raise typer.Exit
 
 
@@ -259,7 +282,7 @@ sweep.register(app)
 
 def _tell(lines: Iterable[str]) -> None:
     for line in lines:
-        print(line, file=sys.stderr)
+        say(line, error=True)
 
 
 def main() -> None:
