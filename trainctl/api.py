@@ -68,7 +68,7 @@ def run(
     backend : {"sumo", "numeric"}
         SUMO, or the same loop without a simulator.
     out : Path, optional
-        Run folder; default ``runs/NAME``, with settings ``runs/NAME,KEY=VALUE``. A run there is replaced, unless more than a run
+        Run folder; default ``runs/NAME``, with settings ``runs/NAME+KEY=VALUE``. A run there is replaced, unless more than a run
         lies there: by default it then goes to ``NAME-2``.
     force : bool
         Replace whatever lies there.

@@ -134,6 +134,8 @@ def _opened(
         raise InputError(f"--checkpoint-every {every:g}: must be a multiple of step_s = {step:g}")
     if every is not None and gui is not None:
         raise InputError("--checkpoint-every: a run that is watched cannot be resumed; leave out --gui")
+    if backend == "sumo" and "," in (place := str(Path(out).absolute())):
+        raise InputError(f"{place}: SUMO takes a comma for the end of a file's name: choose an --out without, or --backend numeric")
     partial = open_partial(out, force)
     with held(partial):
         text = p.scenario.toml()

@@ -41,7 +41,7 @@ def run(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Run folder; default runs/NAME, with --set runs/NAME,KEY=VALUE. A run there is replaced, unless more than a run"
+            help="Run folder; default runs/NAME, with --set runs/NAME+KEY=VALUE. A run there is replaced, unless more than a run"
             " lies there: then it goes to NAME-2."
         ),
     ] = None,

@@ -68,8 +68,11 @@ def beside(folder: Path) -> list[str]:
 
 
 def run_name(scenario: str | Path, settings: Sequence[str] = ()) -> str:
-    """Name of a run by its scenario and the settings ``KEY=VALUE`` that were changed; long ones end in a digest."""
-    name = ",".join([Path(scenario).stem, *(re.sub(r"[^\w.=+\[\]-]+", "-", setting) for setting in settings)])
+    """Name of a run by its scenario and the settings ``KEY=VALUE`` that were changed; long ones end in a digest.
+
+    Without commas: SUMO reads them as the ends of file names.
+    """
+    name = "+".join([Path(scenario).stem, *(re.sub(r"[^\w.=+\[\]-]+", "-", setting) for setting in settings)])
     if len(name) <= NAME_AT_MOST:
         return name
     return f"{name[: NAME_AT_MOST - 9]}~{hashlib.sha256(name.encode()).hexdigest()[:8]}"

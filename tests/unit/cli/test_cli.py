@@ -29,8 +29,8 @@ def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("user")
     done = typed("run", "fully_distributed", "--backend", "numeric", "--set", "run.duration_s=50", "--strict", cwd=place)
     assert done.returncode == 0, done.stderr
-    assert "runs/fully_distributed,run.duration_s=50" in done.stdout
-    return place / "runs" / "fully_distributed,run.duration_s=50"
+    assert "runs/fully_distributed+run.duration_s=50" in done.stdout
+    return place / "runs" / "fully_distributed+run.duration_s=50"
 
 
 def test_help_imports_nothing_heavy():
@@ -142,7 +142,7 @@ def test_nothing_of_the_users_is_replaced(tmp_path):
         return (tmp_path / json.loads(done.stdout)["folder"] if done.returncode == 0 else None), done.stderr
 
     first, said = where()
-    assert first == tmp_path / "runs" / "fully_distributed,run.duration_s=20,run.record_every_s=10.0" and not said
+    assert first == tmp_path / "runs" / "fully_distributed+run.duration_s=20+run.record_every_s=10.0" and not said
     assert where() == (first, "")  # nothing else lies there, so it is replaced
     (first / "notes.md").write_text("mine")
     assert typed("plot", first, "--out", first / "figures", cwd=tmp_path).returncode == 0
@@ -158,7 +158,8 @@ def test_nothing_of_the_users_is_replaced(tmp_path):
 
 def test_runs_are_named_by_their_settings():
     assert run_name("a/my.toml") == "my"
-    assert run_name("my", ["controller.law=../x.py", "train.1=[1, 2]"]) == "my,controller.law=..-x.py,train.1=[1-2]"
+    assert run_name("my", ["controller.law=../x.py", "train.1=[1, 2]"]) == "my+controller.law=..-x.py+train.1=[1-2]"
+    assert "," not in run_name("my", ["a=1", "b=2,3"])  # SUMO would read two files
     long = [run_name("my", [f"bounds.speed_upper_mps={k}" * 9]) for k in (1, 2)]
     assert len(set(long)) == 2 and all(len(name) <= 120 for name in long)
 
