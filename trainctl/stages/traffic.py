@@ -31,6 +31,7 @@ class State(NamedTuple):
     """What the traffic has come to, shape (n,)."""
 
     came: Bools
+    entering: Bools  # they come with the step to this instant, told when they are there
     left: Bools
     next_stop: Ints  # number of it in the roster
     stands_until: Floats  # s, while a train stands at a stop, else NaN
@@ -53,7 +54,7 @@ class State(NamedTuple):
 class Around(NamedTuple):
     """What this instant's traffic means to the trains."""
 
-    entries: tuple[tuple[int, float], ...]  # trains that come now, with their speeds [m/s]
+    entries: tuple[tuple[int, float], ...]  # trains that come with the coming step, with their speeds [m/s]
     stops: tuple[Ints, Floats]  # trains with a stop ahead, and the room to it [m]
     soon: Bools  # (n,) they stop soon
     held: Held | None  # how far each may go before a place that is another's; None: nobody asks
@@ -86,8 +87,8 @@ class Traffic:
         """Before the run: trains that are placed have come."""
         n = len(self.length)
         return State(
-            came=np.full(n, self.roster.placed), left=np.zeros(n, bool), next_stop=np.zeros(n, np.int64),
-            stands_until=np.full(n, np.nan), stopping=np.zeros(n, bool), parked=np.zeros(n, bool),
+            came=np.full(n, self.roster.placed), entering=np.zeros(n, bool), left=np.zeros(n, bool),
+            next_stop=np.zeros(n, np.int64), stands_until=np.full(n, np.nan), stopping=np.zeros(n, bool), parked=np.zeros(n, bool),
             waits_for=np.full(n, -1), requests=interlocking.none(),
         )  # fmt: skip
 
@@ -96,15 +97,17 @@ class Traffic:
     ) -> tuple[State, Around]:
         """Arrivals, stops, entries; ``overrun`` (n,) is how much farther trains run than their brakes promise [m].
 
-        ``speed`` (n,) gets the speeds of trains that enter; at the ``last`` instant of a run nobody does.
+        Who is due at the end of the coming step is let in now, and is there then: in time. ``speed`` (n,) gets the speeds of trains
+        that enter; at the ``last`` instant of a run nobody does.
         """
-        s = self.arrivals(t, seen, s)
+        s = self.departures(t, seen, speed, self.arrivals(t, seen, s))
         if not self.looks:
             return s, nothing(len(speed))
         for i in [] if s.came.all() else np.flatnonzero(~s.came & self._given_up(t) & ~self._given_up(t - self.step_s)).tolist():
             self.journal.event(t, "given_up", train=self.p.scenario.ids[i], planned_s=float(self.roster.depart[i]))
         s, stops, soon = self._stops(t, seen, speed, overrun, s)
-        asking, reach = [] if last else [*self._returning(t, s), *self.due(t, s)], self._reach(speed)
+        later = t + self.step_s
+        asking, reach = [] if last else [*self._returning(later, s), *self.due(later, s)], self._reach(speed)
         s, held, entries, kept_out = self.entering(t, ways, s.on_track(seen), speed, s, asking, reach)
         present = s.on_track(seen).present.copy()
         present[[i for i, _ in entries]] = True
@@ -122,8 +125,20 @@ class Traffic:
             self.journal.event(t, "arrive", train=self.p.scenario.ids[i])
         return s._replace(left=s.left | gone)
 
+    def departures(self, t: float, seen: Seen, speed: Floats, s: State) -> State:
+        """Trains that are there for the first time."""
+        there = s.entering & seen.present
+        if not there.any():
+            return s
+        for i in np.flatnonzero(there).tolist():
+            planned = float(self.roster.depart[i])
+            self.journal.event(
+                t, "depart", train=self.p.scenario.ids[i], planned_s=planned, delay_s=t - planned, speed_mps=float(speed[i])
+            )  # fmt: skip
+        return s._replace(entering=s.entering & ~there)
+
     def due(self, t: float, s: State) -> list[int]:
-        """Trains that are to come now: of each edge the first that waits there."""
+        """Trains that are to come at ``t``: of each edge the first that waits there."""
         if s.came.all():
             return []
         first: dict[int, int] = {}
@@ -149,7 +164,9 @@ class Traffic:
         asking[due] = True
         s, held = self._request(t, ways, here, self._reach(speed) if reach is None else reach, asking, s)
         s = s._replace(parked=s.parked.copy(), stands_until=s.stands_until.copy())
-        present, came, come, kept_out = here.present.copy(), s.came.copy(), [], {}
+        present, came, entering = here.present.copy(), s.came.copy(), s.entering.copy()
+        come: list[tuple[int, float]] = []
+        kept_out: dict[int, int] = {}
         for i in due:
             if held.room[i] <= 0.0:
                 continue
@@ -165,11 +182,9 @@ class Traffic:
             if v is None:
                 kept_out[i] = waiting.kept_out(view, i)
                 continue
-            came[i], speed[i] = True, v
-            planned = float(self.roster.depart[i])
-            self.journal.event(t, "depart", train=self.p.scenario.ids[i], planned_s=planned, delay_s=t - planned, speed_mps=v)
+            came[i], entering[i], speed[i] = True, True, v
             come.append((i, v))
-        return s._replace(came=came), held, tuple(come), kept_out
+        return s._replace(came=came, entering=entering), held, tuple(come), kept_out
 
     def _entering_speed(self, i: int, ways: Ways, here: Seen, speed: Floats, view: View, s: State) -> float | None:
         """Speed with which a train can enter safely; None if it has to wait. ``view`` is that with the train at its place."""
