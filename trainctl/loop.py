@@ -34,7 +34,7 @@ class State(NamedTuple):
 
     k: int  # steps done
     own: Floats  # (U, 2 or 3) position [m], speed [m/s], force [N] of every unit
-    pending: tuple[int, ...]  # numbers of the orders to come
+    orders: orders.State
     traffic: traffic.State
     rule: Any  # of the formation rule: ``slots.State`` or ``convoys.State``
     formed: Formed
@@ -72,7 +72,7 @@ class Loop(Steps):
         self.protect = protect.Protect(p, journal, bool(len(self.disturbances.whole)) or self.plant.noisy)
         rule, formed = self.topology.rule.initial()
         self.state = State(
-            k=0, own=p.own.copy(), pending=self.orders.initial(), traffic=self.traffic.initial(), rule=rule, formed=formed,
+            k=0, own=p.own.copy(), orders=self.orders.initial(), traffic=self.traffic.initial(), rule=rule, formed=formed,
             messages=exchange.silent(), demand=self.control.initial(), memory=(),
             commanded=np.full(len(p.scenario.ids), np.nan), plant=self.plant.initial(), watch=self.record.initial(),
         )  # fmt: skip
@@ -86,7 +86,7 @@ class Loop(Steps):
         own = self._measured(s)
 
         # orders: new routes first, since they change the rows of everybody
-        pending, routes = self.orders.step(t, world.measure(), world.ways, own[leading, SPEED], s.formed.ahead, s.pending)
+        ordered, routes = self.orders.step(t, world.measure(), world.ways, own[leading, SPEED], s.formed.ahead, s.orders)
         for i, edges in routes:
             world.route(i, edges)
         here, ways, speed = world.measure(), world.ways, own[leading, SPEED]
@@ -140,7 +140,7 @@ class Loop(Steps):
         world.move(moved.motion.displacement, p.scenario.run.step_s)
         formed = self.topology.rule.after(formed)
         return State(
-            s.k + 1, moved.own, pending, going, rule, formed, moved.messages, demand, memory, s.commanded, moved.state, watch
+            s.k + 1, moved.own, ordered, going, rule, formed, moved.messages, demand, memory, s.commanded, moved.state, watch
         )  # fmt: skip
 
     def end(self) -> None:
@@ -172,7 +172,7 @@ class Loop(Steps):
 
     def order(self, event: Event) -> None:
         """Give an order from outside."""
-        self.state = self.state._replace(pending=(*self.state.pending, self.orders.add(event)))
+        self.state = self.state._replace(orders=self.orders.added(event, self.state.orders))
 
     def outcome(self) -> dict[str, Any]:
         """What run.json says of the finished run."""

@@ -166,6 +166,15 @@ def leader_at(reference: Reference, t: float, inside: float, out: Floats) -> Non
     evaluate(reference.breaks, reference.position, t, inside, out)
 
 
+@njit(cache=True)
+def leader_over(reference: Reference, times: Floats) -> Floats:
+    """Position, speed, acceleration and jerk of the virtual leader at ``times`` (k,), the later side of a jump: (4, k)."""
+    out = np.empty((len(times), 4))
+    for k in range(len(times)):
+        evaluate(reference.breaks, reference.position, times[k], times[k], out[k])
+    return np.ascontiguousarray(out.T)
+
+
 class Trains(NamedTuple):
     """What each train knows of itself when a sampled law is evaluated, shape (n,)."""
 

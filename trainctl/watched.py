@@ -24,7 +24,7 @@ class State(NamedTuple):
     """All that changes from step to step."""
 
     k: int  # steps done
-    pending: tuple[int, ...]  # numbers of the orders to come
+    orders: orders.State
     entered: Bools  # (n,)
     edge: Ints  # (n,) where every train was last told of, -1: not on the net
     energy: Floats  # (n, 6) J since the last row, as ``POWERS``
@@ -56,7 +56,7 @@ class Watched(Steps):
         self.orders, self.effort = orders.Orders(ruled, journal), Effort(p)
         n = len(p.scenario.ids)
         self.state = State(
-            k=0, pending=self.orders.initial(), entered=np.zeros(n, bool), edge=np.full(n, -1), energy=np.zeros((n, len(POWERS))),
+            k=0, orders=self.orders.initial(), entered=np.zeros(n, bool), edge=np.full(n, -1), energy=np.zeros((n, len(POWERS))),
             watch=self.record.initial(),
         )  # fmt: skip
         world.start()
@@ -70,7 +70,7 @@ class Watched(Steps):
         """The state a step later."""
         world, now, t = self.world, self.world.measure(), self.time
         s = self._told(t, now, s)
-        pending, routes = self.orders.step(t, now.seen, world.ways, now.speed, now.ahead, s.pending)
+        ordered, routes = self.orders.step(t, now.seen, world.ways, now.speed, now.ahead, s.orders)
         for i, edges in routes:
             world.route(i, edges)
         now, ways = world.measure(), world.ways
@@ -78,7 +78,7 @@ class Watched(Steps):
         motion, energy = self.effort.step(now, world.measure())
         due = self.record.due(s.k)
         self._record(t, ways, now, motion, due, s)
-        return s._replace(k=s.k + 1, pending=pending, energy=(0.0 if due else s.energy) + energy)
+        return s._replace(k=s.k + 1, orders=ordered, energy=(0.0 if due else s.energy) + energy)
 
     def end(self) -> None:
         """The last instant, which nothing acts on."""

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from trainctl.cli.console import say
+
 
 def register(app: typer.Typer) -> None:
     """Add the command to the command line."""
@@ -30,8 +32,8 @@ def cite(
         show_json({"run": str(folder), "works": [work.plain() for work in found], "remarks": remarks})
         return
     for work in found:
-        print(work.text())
+        say(work.text())
     for remark in remarks:
-        print(f"({remark})")
+        say(f"({remark})")
     for work in found:
-        print(f"\n{work.bibtex()}")
+        say(f"\n{work.bibtex()}")

@@ -13,11 +13,15 @@ import typer
 from trainctl.errors import InputError
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
     from rich.table import Table
 
     from trainctl.scenario.model import Model
 
 DEFAULT_SCENARIO = "three_tracks"
+
+#: Control characters but tab and newline, and how they are shown.
+STEERING = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\t\n"}
 
 
 app = typer.Typer(
@@ -27,6 +31,7 @@ app = typer.Typer(
     "with the package, `trainctl schema` describes every key.\n\n"
     "Exit codes: 0 done, 1 a check failed, 2 bad input, 3 the run failed, 130 interrupted.",
     no_args_is_help=True,
+    rich_markup_mode="markdown",  # units in brackets are no markup
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -67,17 +72,33 @@ def listing(title: str | None, *columns: str) -> Table:
     from rich import box
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    table = Table(title=title and visible(title), title_justify="left", box=box.SIMPLE_HEAD)
     for k, column in enumerate(columns):
         table.add_column(column, overflow="fold", no_wrap=k == 0)
     return table
 
 
-def show(*things: Any) -> None:
-    """Print tables and text."""
+def visible(text: str) -> str:
+    """Text as it is written: characters that steer a terminal, which titles and ids may hold, are shown as hexadecimal escapes."""
+    return text.translate(STEERING)
+
+
+def fill(table: Table, *cells: RenderableType) -> None:
+    """Add a row to a table."""
+    table.add_row(*(visible(cell) if isinstance(cell, str) else cell for cell in cells))
+
+
+def say(*words: Any, error: bool = False) -> None:
+    """Print a line of text, to standard error if it is one."""
+    print(visible(" ".join(map(str, words))), file=sys.stderr if error else sys.stdout)
+
+
+def show(table: Table) -> None:
+    """Print a table. What stands in its cells is text, not markup."""
     from rich.console import Console
 
-    Console(width=None if sys.stdout.isatty() else 120, highlight=False).print(*things)
+    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False, markup=False, emoji=False)
+    console.print(table)
 
 
 def show_json(value: Any) -> None:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from trainctl.cli.console import say
 from trainctl.errors import InputError
 
 RunFolder = Annotated[Path, typer.Argument(help="Run folder, as `trainctl run` made it.")]
@@ -30,8 +31,8 @@ def new_controller(
 
     folder = out or Path(name)
     for path in controller(name, folder):
-        print(path)
-    print(f"\nNext:\n  trainctl run {folder / name}.toml\n  python -m pytest {folder}")
+        say(path)
+    say(f"\nNext:\n  trainctl run {folder / name}.toml\n  python -m pytest {folder}")
 
 
 def export(
@@ -50,9 +51,9 @@ def export(
     run = Run(folder)
     if form == "csv":
         for path in to_csv(run, out or folder / "export"):
-            print(path)
+            say(path)
     else:
-        print(to_mat(run, out or folder / "export" / f"{folder.resolve().name}.mat"))
+        say(to_mat(run, out or folder / "export" / f"{folder.resolve().name}.mat"))
 
 
 def replay(
@@ -67,4 +68,4 @@ def replay(
 
     if from_s < 0.0 or delay_ms < 0.0:
         raise InputError("--from-s and --delay-ms: must not be negative")
-    print(f"{show(Run(folder), gui_program, from_s, delay_ms)} steps shown")
+    say(f"{show(Run(folder), gui_program, from_s, delay_ms)} steps shown")

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from trainctl.cli.console import listing, show
+from trainctl.cli.console import fill, listing, say, show
 from trainctl.errors import InputError
 
 
@@ -62,9 +62,9 @@ def net_import(
         path.write_text(found.toml, encoding="utf-8")
     except OSError as error:
         raise InputError(f"--out {out}: cannot be written: {error.strerror}") from None
-    print(path)
+    say(path)
     for note in found.notes:
-        print(f"note: {note}")
+        say(f"note: {note}")
 
 
 def net_list() -> None:
@@ -74,8 +74,12 @@ def net_list() -> None:
     table = listing(None, "name", "tracks", "kilometrage", "crossovers")
     for name, path in sumo_net.shipped().items():
         line = sumo_net.Line.of(spec_of(str(path)))
-        table.add_row(
-            name, ", ".join(line.track_ids), f"{line.begin_m / 1000:g} .. {line.end_m / 1000:g} km", str(len(line.crossovers))
+        fill(
+            table,
+            name,
+            ", ".join(line.track_ids),
+            f"{line.begin_m / 1000:g} .. {line.end_m / 1000:g} km",
+            str(len(line.crossovers)),
         )
     show(table)
 
@@ -88,7 +92,7 @@ def net_build(
     import sumo_net
 
     out.mkdir(parents=True, exist_ok=True)
-    print(asked(lambda: sumo_net.build(spec_of(name), out)))
+    say(asked(lambda: sumo_net.build(spec_of(name), out)))
 
 
 def net_show(
@@ -108,11 +112,11 @@ def net_show(
     if net and not asked(lambda: built_here(Path(name))):
         if from_m is not None or to_m is not None:
             raise InputError(f"--from-m, --to-m: {name} has no kilometrage; only lines built by `trainctl net build` have one")
-        print(asked(lambda: show_net(name, path)))
+        say(asked(lambda: show_net(name, path)))
         return
     line = asked(lambda: sumo_net.Line.read(name) if net else sumo_net.Line.of(spec_of(name)))
     asked(lambda: draw(line, path, from_m=from_m, to_m=to_m))
-    print(path)
+    say(path)
 
 
 def spec_of(name: str) -> Any:

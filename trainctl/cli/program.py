@@ -19,9 +19,11 @@ from trainctl.cli.console import (
     ScenarioName,
     Settings,
     app,
+    fill,
     listing,
     named,
     networks,
+    say,
     show,
     show_json,
 )
@@ -80,14 +82,14 @@ def _summary(done: Run, model: Model) -> None:
     from trainctl.runs.outcome import summary
 
     info, metrics = done.info, done.metrics
-    print(model.scenario.title)
+    say(model.scenario.title)
     table = listing(None, "", "")
     table.show_header = False
     law = model.scenario.controller.law
-    table.add_row(
-        "law, plant", f"{law} on {model.scenario.plant.kind}, {len(model.scenario.train)} trains, backend {info['backend']}"
+    fill(
+        table, "law, plant", f"{law} on {model.scenario.plant.kind}, {len(model.scenario.train)} trains, backend {info['backend']}"
     )
-    table.add_row("steps", f"{info['steps']} of {model.scenario.run.step_s:g} s in {info['wall_time_s']:.1f} s")
+    fill(table, "steps", f"{info['steps']} of {model.scenario.run.step_s:g} s in {info['wall_time_s']:.1f} s")
     for key, words, unit in (
         ("bounds.spacing_lower_margin_m", "minimum spacing above its lower bound", "m"),
         ("bounds.spacing_upper_margin_m", "minimum room below the upper spacing bound", "m"),
@@ -99,13 +101,13 @@ def _summary(done: Run, model: Model) -> None:
         ("formation.final_error_m", "largest spacing error at the end", "m"),
     ):
         if isinstance(metrics.get(key), int | float):
-            table.add_row(words, f"{metrics[key]:.6g} {unit}")
+            fill(table, words, f"{metrics[key]:.6g} {unit}")
     for line in summary(done):
-        table.add_row(line.title, f"FAILED: {line.text}" if line.failed else line.text)
-    table.add_row("results", f"{done.folder}/  (trainctl plot {done.folder}; trainctl metrics {done.folder})")
+        fill(table, line.title, f"FAILED: {line.text}" if line.failed else line.text)
+    fill(table, "results", f"{done.folder}/  (trainctl plot {done.folder}; trainctl metrics {done.folder})")
     show(table)
     for note in model.roster.notes:
-        print(f"warning: {note}")
+        say(f"warning: {note}")
 
 
 @app.command("list")
@@ -122,7 +124,7 @@ def list_(as_json: Json = False) -> None:
         return
     table = listing(None, "name", "law", "title")
     for row in rows:
-        table.add_row(row["name"], row["law"], row["title"])
+        fill(table, row["name"], row["law"], row["title"])
     show(table)
 
 
@@ -136,19 +138,19 @@ def check(name: ScenarioName = DEFAULT_SCENARIO, settings: Settings = None, as_j
     if as_json:
         show_json(found)
         return
-    print(f"{model.file}: no mistakes, no start condition of {model.scenario.controller.law} violated")
+    say(f"{model.file}: no mistakes, no start condition of {model.scenario.controller.law} violated")
     table = listing(None, "", "")
     table.show_header = False
     for key, value in found.items():
         if key not in ("warnings", "report", "analysis", "protection", "promise"):
-            table.add_row(key, str(value))
+            fill(table, key, str(value))
     show(table)
     for k, line in enumerate(found.get("promise", ())):
-        print(f"protection: {line}" if not k else f"  - {line}")
+        say(f"protection: {line}" if not k else f"  - {line}")
     for line in found["report"]:
-        print(line)
+        say(line)
     for line in found["warnings"]:
-        print(f"warning: {line}")
+        say(f"warning: {line}")
 
 
 @app.command()
@@ -171,7 +173,7 @@ def metrics(
             return
         table = listing(None, "metric", "unit", "definition")
         for key, (unit, text) in measured.DEFINITIONS.items():
-            table.add_row(key, unit, text)
+            fill(table, key, unit, text)
         show(table)
         return
     if folder is None:
@@ -191,7 +193,7 @@ def metrics(
     for key, value in values.items():
         if everything or "/" not in key:
             unit = measured.DEFINITIONS.get(key.partition("/")[0], ("", ""))[0]
-            table.add_row(key, f"{value:.6g}" if isinstance(value, float) else str(value), unit)
+            fill(table, key, f"{value:.6g}" if isinstance(value, float) else str(value), unit)
     show(table)
 
 
@@ -211,7 +213,7 @@ def plot(
     if wrong:
         raise InputError([f"--format {f}: must be one of png, svg, pdf" for f in wrong])
     for path in draw(Run(folder), out or folder / "figures", wanted, width):
-        print(path)
+        say(path)
 
 
 @app.command()
@@ -234,7 +236,7 @@ def _version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
-        print(f"trainctl {version('trainctl')}, SUMO {version('libsumo')}")
+        say(f"trainctl {version('trainctl')}, SUMO {version('libsumo')}")
         raise typer.Exit
 
 
@@ -259,7 +261,7 @@ sweep.register(app)
 
 def _tell(lines: Iterable[str]) -> None:
     for line in lines:
-        print(line, file=sys.stderr)
+        say(line, error=True)
 
 
 def main() -> None:

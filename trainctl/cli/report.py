@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from trainctl.cli.console import fill, say
 from trainctl.errors import InputError
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ def report(
     from trainctl.report.page import report as write
     from trainctl.runs.run import Run
 
-    print(write(Run(folder), out))
+    say(write(Run(folder), out))
 
 
 def compare(
@@ -110,20 +111,18 @@ def compare(
         return
     table = listing(None, "metric", *(label.replace("_", " ") for label in labels), "unit")
     for row in rows:
-        table.add_row(row["metric"], *(_shown(value) for value in row["values"]), row["unit"])
+        fill(table, row["metric"], *(_shown(value) for value in row["values"]), row["unit"])
     show(table)
     for name, reasons in left_out.items():
         for reason in reasons:
-            print(f"{name} is left out: {reason}")
+            say(f"{name} is left out: {reason}")
     for path in figures:
-        print(path)
+        say(path)
 
 
 def _capacity(given: dict[str, Any], out: Path, formats: tuple[str, ...], workers: int | None, as_json: bool) -> None:
     """Run, measure and show how much a line carries; rows that failed are told and make the exit code 3."""
     import sys
-
-    from rich.markup import escape
 
     from trainctl.cli.console import Progress, listing, show, show_json
     from trainctl.studies import capacity
@@ -136,15 +135,15 @@ def _capacity(given: dict[str, Any], out: Path, formats: tuple[str, ...], worker
         show_json(table)
     else:
         km, kmh = plan.length_m / 1000.0, 3.6 * plan.speed_mps
-        shown = listing(f"{plan.trains} trains over {km:g} km at {kmh:.3g} km/h at most", *map(escape, capacity.COLUMNS))
+        shown = listing(f"{plan.trains} trains over {km:g} km at {kmh:.3g} km/h at most", *capacity.COLUMNS)
         for row in table:
-            shown.add_row(row["row"].replace("_", " "), *(_shown(row[key]) for key in list(capacity.COLUMNS.values())[1:]))
+            fill(shown, row["row"].replace("_", " "), *(_shown(row[key]) for key in list(capacity.COLUMNS.values())[1:]))
         show(shown)
         for path in pictures:
-            print(path)
+            say(path)
     failed = [f"{row['row']}: {row['error']}" for row in table if row["error"]]
     for line in failed:
-        print(line, file=sys.stderr)
+        say(line, error=True)
     if failed:
         raise typer.Exit(3)
 
@@ -211,22 +210,21 @@ def claims(
     if as_json:
         show_json([claim._asdict() for claim in found])
     elif markdown:
-        print(as_markdown(found))
+        say(as_markdown(found))
     else:
-        from rich.markup import escape
         from rich.text import Text
 
         colours = {REPRODUCED: "green", WITH_CORRECTION: "yellow", NOT: "red", BEYOND: "blue"}
         for name in dict.fromkeys(claim.paper for claim in found):
-            table = listing(f"{name}: {escape(PAPERS[name].text())}")
+            table = listing(f"{name}: {PAPERS[name].text()}")
             for column, share in (("claim", 5), ("paper", 2), ("measured", 2), ("unit", None), ("verdict", None), ("note", 5)):
                 table.add_column(column, ratio=share, overflow="fold")
             for claim in found:
                 if claim.paper == name:
                     cells = [Text(_shown(value)) for value in claim[1:]]
                     cells[4].stylize(colours[claim.verdict])
-                    table.add_row(*cells)
+                    fill(table, *cells)
             show(table)
         for verdict, words in VERDICTS.items():
-            print(f"{verdict}: {words}")
-        print(f"{len(found)} claims: {counts(found)}")
+            say(f"{verdict}: {words}")
+        say(f"{len(found)} claims: {counts(found)}")

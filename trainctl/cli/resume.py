@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from trainctl.cli.console import say
+
 
 def register(app: typer.Typer) -> None:
     """Add the command to the command line."""
@@ -40,8 +42,8 @@ def resume(
             how = f"resumed at {since:g} s"
         else:
             how = "there was no checkpoint: run again from the beginning"
-        print(f"{done.folder}: complete, {done.info['steps']} steps ({how})")
+        say(f"{done.folder}: complete, {done.info['steps']} steps ({how})")
         for line in summary(done):
-            print(f"{'FAILED: ' if line.failed else ''}{line.title}: {line.text}")
+            say(f"{'FAILED: ' if line.failed else ''}{line.title}: {line.text}")
     if not done.ok or (strict and done.info["violations"]):
         raise typer.Exit(1)

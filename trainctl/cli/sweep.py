@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from trainctl.cli.console import fill, say
 from trainctl.errors import InputError
 
 if TYPE_CHECKING:
@@ -112,7 +113,7 @@ class _Progress:
         if self.bar is not None:
             self.bar.update(self.task, completed=done, total=total, description=words)
         elif self.shown and done * 10 // total > (done - 1) * 10 // total:
-            print(f"{self.title}: {done} of {total} runs{words}", file=sys.stderr)
+            say(f"{self.title}: {done} of {total} runs{words}", error=True)
 
     def __exit__(self, *_: object) -> None:
         if self.bar is not None:
@@ -125,23 +126,22 @@ def _summary(folder: Path, info: dict[str, Any]) -> None:
     from trainctl.studies.results import shares
 
     told = {key: info[key] for key in ("complete", "refused", "failed") if info[key] or key == "complete"}
-    print(f"{info['runs']} runs: " + ", ".join(f"{count} {word}" for word, count in told.items()))
+    say(f"{info['runs']} runs: " + ", ".join(f"{count} {word}" for word, count in told.items()))
     varied = [key for key, values in info["set"].items() if len(values) > 1]
     rows = shares(folder, varied)
     table = listing(None, *varied, "runs", "with a violated bound", "share", "95 % interval")
     for row in rows[:40]:
         low, high = row["interval_95"]
-        table.add_row(
-            *map(str, row["values"]), str(row["of"]), str(row["runs"]), f"{100 * row['share']:.3g} %",
+        fill(table, *map(str, row["values"]), str(row["of"]), str(row["runs"]), f"{100 * row['share']:.3g} %",
             f"{100 * low:.3g} .. {100 * high:.3g} %",
         )  # fmt: skip
     if rows:
         show(table)
     if len(rows) > 40:
-        print(f"and {len(rows) - 40} more combinations")
+        say(f"and {len(rows) - 40} more combinations")
     for key, words in (("with_collisions", "trains collided"), ("with_gridlocks", "trains waited for each other in a circle")):
         if info[key]:
-            print(f"in {info[key]} of {info['complete']} runs {words}")
+            say(f"in {info[key]} of {info['complete']} runs {words}")
     for reason in info["reasons"]:
-        print(reason)
-    print(f"results: {folder}/  (results.parquet, summary.png)")
+        say(reason)
+    say(f"results: {folder}/  (results.parquet, summary.png)")

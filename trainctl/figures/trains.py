@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from trainctl.figures import style
-from trainctl.runs.known import Facts, facts, leader
+from trainctl.runs.known import Facts, facts
 from trainctl.runs.run import Run
 from trainctl.runs.series import INSTANT, Pairs, Series, pairs, series
-from trainctl.signals import Bools, Floats
+from trainctl.signals import Bools, Floats, leader_over
 
 #: Events that the train graph marks.
 SHOWN_EVENTS = ("topology", "reroute", "join", "leave", "fault", "limit")
@@ -76,12 +76,12 @@ def positions(drawn: Drawn) -> Figure:
     time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
     inside = in_formation(drawn)
     for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
-        relative = position[rows] - (0.0 if reference is None else leader(reference, time[rows])[0])
+        relative = position[rows] - (0.0 if reference is None else leader_over(reference, time[rows])[0])
         for panel, value in zip(axes, (position[rows] / 1000, relative / 1000), strict=False):
             _in_and_out(panel, time[rows], value, inside[rows], drawn.colour[name], label)
     if reference is not None:
         instants = drawn.instants
-        style.draw(axes[0], instants, leader(reference, instants)[0] / 1000, color="black", linestyle=":", label="reference")
+        style.draw(axes[0], instants, leader_over(reference, instants)[0] / 1000, color="black", linestyle=":", label="reference")
         axes[1].set_ylabel(r"$x_i - x_r$ [km]")
     axes[0].set_ylabel("position [km]")
     _finish(figure, axes, drawn)
@@ -150,7 +150,7 @@ def draw_speeds(panel: Axes, drawn: Drawn) -> None:
     _draw_trains(panel, drawn, "speed_mps", drawstyle="default")
     if drawn.known.reference is not None:
         instants = drawn.instants
-        reference = leader(drawn.known.reference, instants)[1]
+        reference = leader_over(drawn.known.reference, instants)[1]
         style.draw(panel, instants, reference, color="black", linestyle=":", label="reference", zorder=3)
     if drawn.known.cruise_mps is not None:
         style.bound(panel, drawn.known.cruise_mps, label="cruising speed", color="black", linestyle=":")
@@ -198,7 +198,7 @@ def train_graph(drawn: Drawn) -> Figure:
         cuts = np.flatnonzero(on[1:] != on[:-1]) + 1
         switched |= len(cuts) > 0
         absolute = position[rows] / 1000
-        relative = absolute - (0.0 if reference is None else leader(reference, at)[0] / 1000)
+        relative = absolute - (0.0 if reference is None else leader_over(reference, at)[0] / 1000)
         for panel, value in zip(axes, (absolute, relative), strict=False):
             for begin, end in zip([0, *cuts], [*cuts, len(at)], strict=True):
                 line = style.TRACK_STYLES[tracks.index(on[begin]) % len(style.TRACK_STYLES)]
@@ -279,7 +279,7 @@ def speed_over_position(drawn: Drawn) -> Figure:
     for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
         axes[0].plot(*style.envelope(position[rows], speed[rows]), label=label, **drawn.look[name])
     if drawn.known.reference is not None:
-        where, reference = leader(drawn.known.reference, drawn.instants)
+        where, reference = leader_over(drawn.known.reference, drawn.instants)
         axes[0].plot(where / 1000, reference, color="black", linestyle=":", label="reference", zorder=3)
     axes[0].set_xlabel("position [km]")
     axes[0].set_ylabel("speed [m/s]")

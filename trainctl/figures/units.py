@@ -13,8 +13,7 @@ from matplotlib.figure import Figure
 from trainctl.figures import style
 from trainctl.figures.trains import Drawn
 from trainctl.metrics.values import at_least, at_most
-from trainctl.runs.known import leader
-from trainctl.signals import Floats
+from trainctl.signals import Floats, leader_over
 
 #: Stretch of time of a magnified panel [s].
 ZOOM_S = 60.0
@@ -178,7 +177,7 @@ def _over_time(drawn: Drawn, column: str, label: str, scale: float, derivative: 
     _bands(axes[0], drawn, value, value, value, "unit ")
     if drawn.known.reference is not None:
         instants = drawn.instants
-        reference = leader(drawn.known.reference, instants)[derivative] / scale
+        reference = leader_over(drawn.known.reference, instants)[derivative] / scale
         style.draw(axes[0], instants, reference, color="black", linestyle=":", label="reference", zorder=3)
     axes[0].set_ylabel(label)
     return _finished(figure, axes, drawn)

@@ -14,10 +14,10 @@ from trainctl.errors import InputError
 from trainctl.metrics import driving, punctuality, traffic
 from trainctl.metrics.values import Values, at_least, at_most, put_worst
 from trainctl.monitors.outcome import GAP
-from trainctl.runs.known import UNBOUNDED, Facts, facts, leader
+from trainctl.runs.known import UNBOUNDED, Facts, facts
 from trainctl.runs.run import Run
 from trainctl.runs.series import INSTANT, Pairs, Series, pairs, series
-from trainctl.signals import Floats
+from trainctl.signals import Floats, leader_over
 
 #: A bound counts as violated beyond this (m, m/s or m/s2): positions read back from the simulator are exact to 3e-10 m.
 SLACK = 1e-6
@@ -208,7 +208,7 @@ def of_reference(trains: Series, known: Facts, band: float) -> Values:
         return {}
     values: Values = {}
     time, speed = trains.column("time_s"), trains.column("speed_mps")
-    error = speed - leader(known.reference, time)[1]
+    error = speed - leader_over(known.reference, time)[1]
     last = np.abs(time - time.max()) < INSTANT
     put_worst(values, "formation.final_speed_error_mps", trains, np.where(last, np.abs(error), -np.inf), np.maximum)
     overshoot = np.zeros(len(time))

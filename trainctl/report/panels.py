@@ -16,9 +16,8 @@ from trainctl.figures import style
 from trainctl.figures.trains import Drawn, in_formation
 from trainctl.metrics.driving import JOULES_PER_KWH
 from trainctl.metrics.values import at_least, at_most
-from trainctl.runs.known import leader
 from trainctl.runs.series import INSTANT
-from trainctl.signals import Bools, Floats
+from trainctl.signals import Bools, Floats, leader_over
 
 Panel = dict[str, Any]
 Trace = dict[str, Any]
@@ -95,7 +94,7 @@ def _train_graph(drawn: Drawn) -> Iterator[Panel]:
         for train, rows in drawn.trains.slices():
             value = position[rows] / 1000
             if name == "relative" and reference is not None:
-                value = value - leader(reference, time[rows])[0] / 1000
+                value = value - leader_over(reference, time[rows])[0] / 1000
             for k, place in enumerate(lateral):
                 here = on[rows] == place
                 if not here.any():
@@ -107,7 +106,7 @@ def _train_graph(drawn: Drawn) -> Iterator[Panel]:
                     len(drawn.trains.names), dash=DASHES[k % len(DASHES)], group=train,
                 ))  # fmt: skip
         if reference is not None and name == "graph":
-            traces.append(_reference(drawn, leader(reference, drawn.instants)[0] / 1000))
+            traces.append(_reference(drawn, leader_over(reference, drawn.instants)[0] / 1000))
         yield panel(name, title, unit, traces, note="One colour per train, one dash per track." if name == "graph" else "")
 
 
@@ -134,7 +133,7 @@ def _speeds(drawn: Drawn) -> Panel:
     speed = drawn.trains.column("speed_mps")
     traces = list(_in_and_out(drawn, speed)) if drawn.known.traffic else _of_trains(drawn, speed)
     if drawn.known.reference is not None:
-        traces.append(_reference(drawn, leader(drawn.known.reference, drawn.instants)[1]))
+        traces.append(_reference(drawn, leader_over(drawn.known.reference, drawn.instants)[1]))
     bounds = _limits(value for pair in drawn.known.speed_mps.values() for value in pair)
     if drawn.known.cruise_mps is not None:
         bounds.append({"value": drawn.known.cruise_mps, "name": "cruising speed", "dash": "dot"})

@@ -12,7 +12,7 @@ import numpy as np
 from trainctl.errors import InputError
 from trainctl.runs.run import Run
 from trainctl.scenario.reference import Profile
-from trainctl.signals import Floats, Reference
+from trainctl.signals import Reference
 
 Range = tuple[float, float]
 UNBOUNDED: Range = (-math.inf, math.inf)
@@ -38,18 +38,6 @@ class Facts:
     reference: Reference | None = None  # of all trains; None where every formation has its own
     traffic: bool = False  # trains come and go on a net of any shape
     cruise_mps: float | None = None  # what they drive at where nothing else holds them
-
-
-def leader(reference: Reference, time: Floats) -> tuple[Floats, Floats]:
-    """Position [m] and speed [m/s] of the virtual leader at ``time`` (k,), the later side of a jump."""
-    last = len(reference.position) - 1
-    piece = np.clip(np.searchsorted(reference.breaks, time, side="right") - 1, 0, last)
-    s = time - reference.breaks[piece]
-    position, speed = np.zeros_like(s), np.zeros_like(s)
-    for power in range(reference.position.shape[1] - 1, -1, -1):
-        speed = speed * s + position
-        position = position * s + reference.position[piece, power]
-    return position, speed
 
 
 def facts(run: Run) -> Facts:

@@ -7,7 +7,7 @@ the scenario that leads nowhere (its switch lies behind the train) is a mistake 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,29 +29,39 @@ class LeadsNowhere(Refused):
     """There is no such way from where the train is, braking distance or not."""
 
 
+class State(NamedTuple):
+    """Orders that are still to come."""
+
+    pending: tuple[int, ...]  # their numbers
+    given: list[dict[str, Any]]  # all that came from outside, as tables; their numbers follow those of the scenario
+
+
 class Orders:
     """Orders of a run. Those of the scenario are numbered from 1 by their tables; more may be added from outside."""
 
     def __init__(self, p: Model, journal: Journal) -> None:
         self.p, self.journal = p, journal
-        self.known: list[Event] = list(p.scenario.event)
         self.length = p.consists.train_length()
         self.theta = p.step_theta
 
-    def initial(self) -> tuple[int, ...]:
-        """Numbers of the orders to come, by time."""
-        return tuple(number for number, _ in sorted(enumerate(self.known, 1), key=lambda e: e[1].time_s))
+    def initial(self) -> State:
+        """The orders of the scenario, by time."""
+        return State(tuple(number for number, _ in sorted(enumerate(self.p.scenario.event, 1), key=lambda e: e[1].time_s)), [])
 
-    def add(self, event: Event) -> int:
-        """One more order; its number."""
+    def added(self, event: Event, s: State) -> State:
+        """One more order, from outside."""
         if event.train not in self.p.scenario.ids:
             raise ValueError(f"train {event.train}: no such train; there are: {', '.join(self.p.scenario.ids)}")
-        self.known.append(event)
-        return len(self.known)
+        given = [*s.given, event.model_dump(mode="json", exclude_none=True)]
+        return State((*s.pending, len(self.p.scenario.event) + len(given)), given)
+
+    def _event(self, number: int, s: State) -> Event:
+        own = self.p.scenario.event
+        return own[number - 1] if number <= len(own) else Event.model_validate(s.given[number - len(own) - 1])
 
     def step(
-        self, t: float, seen: Seen, ways: Ways, speed: Floats, ahead: Ints, pending: tuple[int, ...]
-    ) -> tuple[tuple[int, ...], list[tuple[int, tuple[str, ...]]]]:
+        self, t: float, seen: Seen, ways: Ways, speed: Floats, ahead: Ints, s: State
+    ) -> tuple[State, list[tuple[int, tuple[str, ...]]]]:
         """Orders whose time, place or condition has come: trains and their new routes.
 
         Parameters
@@ -64,20 +74,20 @@ class Orders:
             Their ways now.
         speed, ahead : ndarray, shape (n,)
             Speed [m/s], and the train ahead in the formation, -1 if none.
-        pending : tuple of int
-            Numbers of the orders to come.
+        s : State
+            Orders to come.
 
         Returns
         -------
-        tuple of int
+        State
             Orders that are still to come.
         list of (int, tuple of str)
             Train and edges from the one it is on, internal ones included.
         """
         found: list[tuple[int, tuple[str, ...]]] = []
-        due = [number for number in pending if self._is_due(t, self.known[number - 1], seen, speed, ahead)]
+        due = [number for number in s.pending if self._is_due(t, self._event(number, s), seen, speed, ahead)]
         for number in due:
-            event = self.known[number - 1]
+            event = self._event(number, s)
             i = self.p.scenario.ids.index(event.train)
             lock = float(supervisor.stopping_distance(
                 np.maximum(speed[i : i + 1], 0.0), self.p.supervision.service_mps2, self.p.scenario.run.step_s, self.theta
@@ -100,7 +110,7 @@ class Orders:
                 continue
             self.journal.event(t, "reroute", train=event.train, **more)
             found.append((i, edges))
-        return tuple(number for number in pending if number not in due) if due else pending, found
+        return s._replace(pending=tuple(number for number in s.pending if number not in due)) if due else s, found
 
     def _is_due(self, t: float, event: Event, seen: Seen, speed: Floats, ahead: Ints) -> bool:
         if event.time_s > t + 1e-9:

@@ -21,8 +21,8 @@ from trainctl.figures.trains import Drawn, draw_inputs, draw_speeds, drawable
 from trainctl.laws import compared, find_plant, plants_of
 from trainctl.metrics.run import DEFINITIONS, metrics
 from trainctl.metrics.values import Values
-from trainctl.runs.known import leader
 from trainctl.runs.run import Run
+from trainctl.signals import leader_over
 
 #: Rows of the table, as far as they apply to any of the runs.
 ROWS = (
@@ -105,7 +105,7 @@ def _relative(axes: Axes, drawn: Drawn) -> None:
     time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
     reference = drawn.known.reference
     for name, rows in drawn.trains.slices():
-        at = 0.0 if reference is None else leader(reference, time[rows])[0]
+        at = 0.0 if reference is None else leader_over(reference, time[rows])[0]
         style.draw(axes, time[rows], (position[rows] - at) / 1000, label=f"train {name}", **drawn.look[name])
     axes.set_ylabel("position [km]" if reference is None else r"$x_i - x_r$ [km]")
 

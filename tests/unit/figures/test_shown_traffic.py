@@ -24,7 +24,7 @@ from trainctl.scenario.build import open_scenario
 from trainctl.sumo import gui
 from trainctl.sumo.replay import replay
 
-MERGING = Path(__file__).resolve().parents[2] / "scenarios"
+MERGING = Path(__file__).resolve().parents[3] / "scenarios"
 SETTINGS = {"run.duration_s": 720}
 
 

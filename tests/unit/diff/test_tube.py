@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from trainctl.diff.tube import GAP_S, half_widths, inside, tube
 
-SHARED = Path(__file__).parents[3] / "shared" / "data" / "pyfunnel"
+SHARED = Path(__file__).parents[4] / "shared" / "data" / "pyfunnel"
 
 
 def flat(*values):

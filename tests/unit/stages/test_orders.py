@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from staged import started
@@ -9,6 +12,7 @@ from staged import started
 from trainctl.errors import InputError
 from trainctl.scenario.build import open_scenario
 from trainctl.scenario.tables import Event
+from trainctl.stages.orders import Orders, State
 
 
 @pytest.fixture
@@ -29,25 +33,34 @@ class Asked:
         return self.orders.step(t, seen, self.world.ways, np.full(6, speed), self.alone if ahead is None else ahead, pending)
 
     def order(self, **more):
-        return (self.orders.add(Event(kind="reroute", train="1", **more)),)
+        return self.orders.added(Event(kind="reroute", train="1", **more), State((), []))
 
 
 def test_orders_of_the_scenario_come_by_time(asked):
     p = open_scenario("three_tracks")
-    assert asked.orders.initial() == (1, 2)
-    late = [e.model_copy(update={"time_s": t}) for e, t in zip(p.scenario.event, (50.0, 10.0), strict=True)]
-    asked.orders.known[:] = late
-    assert asked.orders.initial() == (2, 1)
+    assert asked.orders.initial() == State((1, 2), [])
+    late = tuple(e.model_copy(update={"time_s": t}) for e, t in zip(p.scenario.event, (50.0, 10.0), strict=True))
+    later = replace(p, scenario=p.scenario.model_copy(update={"event": late}))
+    assert Orders(later, asked.told).initial() == State((2, 1), [])
     with pytest.raises(ValueError, match="no such train"):
-        asked.orders.add(Event(kind="reroute", train="9", to_track="3"))
+        asked.orders.added(Event(kind="reroute", train="9", to_track="3"), State((), []))
+
+
+def test_orders_from_outside_lie_in_the_state(asked):
+    """What a checkpoint holds is enough to follow them: numbers of the scenario's, tables of the others."""
+    s = asked.orders.added(Event(kind="reroute", train="1", to_track="3", time_s=10.0), asked.orders.initial())
+    assert s.pending == (1, 2, 3) and s.given == [{"kind": "reroute", "train": "1", "to_track": "3", "time_s": 10.0}]
+    fresh = Asked()  # one that was never told
+    s, [(train, _)] = fresh.step(State((3,), json.loads(json.dumps(s.given))), 10.0)
+    assert (s.pending, train, fresh.told.kinds()) == ((), 0, [("reroute", "1")])
 
 
 def test_time_place_gap_and_speed_are_waited_for(asked):
     front = float(asked.world.measure().position[0])
     number = asked.order(to_track="3", time_s=10.0)
     assert asked.step(number, 9.0) == (number, [])
-    pending, [(train, edges)] = asked.step(number, 10.0)
-    assert (pending, train) == ((), 0) and edges[0] == asked.line.edges[asked.world.measure().edge[0]]
+    left, [(train, edges)] = asked.step(number, 10.0)
+    assert (left.pending, train) == ((), 0) and edges[0] == asked.line.edges[asked.world.measure().edge[0]]
     assert asked.told.kinds() == [("reroute", "1")] and asked.told[0][1]["to_track"] == "3"
     for key, holds, fails in (
         ({"position_m": front + 1.0}, {"position": asked.world.measure().position + 1.0}, {}),
@@ -55,14 +68,14 @@ def test_time_place_gap_and_speed_are_waited_for(asked):
     ):
         number = asked.order(to_track="3", **key)
         assert asked.step(number, **fails) == (number, [])
-        assert asked.step(number, **holds)[0] == ()
+        assert asked.step(number, **holds)[0].pending == ()
     number, ahead = asked.order(to_track="3", gap_below_m=300.0), asked.alone.copy()
     assert asked.step(number) == (number, [])  # nobody is ahead
     ahead[0] = 1
     position, length = asked.world.measure().position, asked.p.consists.train_length()
     for gap, due in ((300.5, False), (299.5, True)):
         position[1] = position[0] + length[1] + gap
-        assert (asked.step(number, ahead=ahead, position=position)[0] == ()) is due
+        assert (asked.step(number, ahead=ahead, position=position)[0].pending == ()) is due
 
 
 def test_a_train_that_has_not_come_gets_no_order(asked):
@@ -82,9 +95,10 @@ def test_what_cannot_be_done_is_refused_once_with_the_reason(asked):
         number = asked.order(**key)
         position = seen.position.copy()
         position[0] += move
-        assert asked.step(number, position=position) == ((), [])
+        left, found = asked.step(number, position=position)
+        assert (left.pending, found) == ((), [])
         kind, said = asked.told[-1]
-        assert kind == "reroute_refused" and words in said["reason"] and said["order"] == number[0]
+        assert kind == "reroute_refused" and words in said["reason"] and said["order"] == number.pending[0]
     assert len(asked.told) == 2
 
 
@@ -97,7 +111,8 @@ def test_unsupervised_an_order_of_the_scenario_that_leads_nowhere_ends_the_run()
     for i in (0, 1):
         position[i], edge[i] = beyond, line.locate("1", beyond)[0]
     with pytest.raises(InputError, match=r"event\[1\]"):
-        asked.step((1,), position=position, edge=edge)
+        asked.step(State((1,), []), position=position, edge=edge)
     number = asked.order(crossover=crossover)
-    assert asked.step(number, position=position, edge=edge) == ((), [])  # one from outside is refused
+    left, found = asked.step(number, position=position, edge=edge)
+    assert (left.pending, found) == ((), [])  # one from outside is refused
     assert asked.told.kinds() == [("reroute_refused", "1")]

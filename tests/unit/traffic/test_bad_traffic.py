@@ -9,7 +9,7 @@ import pytest
 
 from trainctl.errors import SimulatorError
 
-MERGING = Path(__file__).resolve().parents[2] / "scenarios"
+MERGING = Path(__file__).resolve().parents[3] / "scenarios"
 
 
 @pytest.fixture

@@ -9,6 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
+import tomli_w
+
+from trainctl.scenario.reading import read
 
 BIN = Path(sys.executable).parent / "trainctl"
 
@@ -102,3 +105,25 @@ def test_an_interrupted_run_says_so(tmp_path):
     info = json.loads((tmp_path / "r.partial" / "run.json").read_text())
     assert info["status"] == "interrupted"
     assert not (tmp_path / "r").exists()
+
+
+def test_titles_and_ids_are_shown_as_text(tmp_path):
+    """Words in brackets are no markup, and nothing in a file steers the terminal."""
+    title, name = "[/red] \x1b[32mX\x1b]0;pwn\x07", "[bold]a"
+    scenario = read("fully_distributed", {"title": title, "run.duration_s": 20.0})[0]
+    scenario["train"][0]["id"] = name
+    for link in scenario["link"]:
+        link["between"] = [name if train == 1 else train for train in link["between"]]
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(scenario))
+    for command in (["check"], ["run", "--backend", "numeric"]):
+        done = typed(*command, "s.toml", cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert "[/red] \\x1b[32mX\\x1b]0;pwn\\x07" in done.stdout
+        assert "\x1b" not in done.stdout + done.stderr
+    assert name in typed("check", "s.toml", cwd=tmp_path).stdout
+
+
+def test_units_in_brackets_stand_in_the_help():
+    assert "[ms]" in typed("replay", "--help").stdout
+    module = subprocess.run([sys.executable, "-m", "trainctl", "replay", "--help"], capture_output=True, text=True, check=True)
+    assert "[ms]" in module.stdout and "python -m trainctl replay" in module.stdout

@@ -188,7 +188,7 @@ BUSY = {
 CHANGED = {
     "units": ("watch.acting", "commanded", "messages.heard", "plant.extremes", "alarms.tally", "demand"),
     "actuators": ("plant.sent_at", "plant.counted", "plant.heard", "plant.estimate", "messages.sent"),
-    "points": ("pending", "messages.ever", "rule.track", "formed.formation", "messages.sent"),
+    "points": ("orders.pending", "messages.ever", "rule.track", "formed.formation", "messages.sent"),
     "formations, stops": (
         "requests", "came", "left", "next_stop", "stands_until", "stopping", "rule.slot", "ask_at", "parted", "refused",
         "formed.ahead", "formed.led", "formed.offset", "references.position",

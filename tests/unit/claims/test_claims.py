@@ -13,7 +13,7 @@ from trainctl.citation import PAPERS
 from trainctl.claims import BEYOND, NOT, REPRODUCED, VERDICTS, WITH_CORRECTION, Claim, as_markdown, counts, loops, measure
 from trainctl.claims.claim import claim, span
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "trainctl" / "claims" / "README.md"
 
 

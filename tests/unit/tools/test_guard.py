@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-FILE = Path(__file__).resolve().parents[2] / "tools" / "guard.py"
+FILE = Path(__file__).resolve().parents[3] / "tools" / "guard.py"
 spec = importlib.util.spec_from_file_location("guard", FILE)
 guard = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(guard)

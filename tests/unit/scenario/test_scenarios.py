@@ -14,7 +14,7 @@ from trainctl.scenario.build import open_scenario
 from trainctl.scenario.reading import _read, examine, load, shipped
 from trainctl.scenario.tables import Scenario
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 PAGE = (ROOT / "scenarios" / "README.md").read_text()
 COMPLETE = next(block for block in re.findall(r"```toml\n(.*?)```", PAGE, re.S) if "schema_version" in block)
 

@@ -111,7 +111,7 @@ def test_a_killed_run_is_readable_to_its_last_cut_and_goes_on_to_the_same_bytes(
     script = f"""
 import json, pathlib, sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})
-import test_record_recorder as here
+import test_recorder as here
 here.Recorder = here.Killed
 cut = here.Recorder.cut
 here.Recorder.cut = lambda self: pathlib.Path({str(tmp_path / "cut.json")!r}).write_text(json.dumps(cut(self)))

@@ -13,7 +13,7 @@ import pytest
 
 import trainctl
 
-FILE = Path(__file__).resolve().parents[2] / "tools" / "bench.py"
+FILE = Path(__file__).resolve().parents[3] / "tools" / "bench.py"
 spec = importlib.util.spec_from_file_location("bench", FILE)
 bench = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(bench)

@@ -11,7 +11,7 @@ import sumo_net
 from sumo_net.importing import Options, convert
 from sumo_net.spec import LineError, parse_spec
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
+DATA = Path(__file__).resolve().parents[3].parent / "shared" / "data"
 REAL = [
     *sorted((DATA / "ttobench" / "tracks").glob("*.json")),
     DATA / "trainruns" / "realworld.yaml",

@@ -20,7 +20,7 @@ from trainctl.scenario.build import open_scenario
 from trainctl.signals import Demand, Disturbed
 from trainctl.stages.control import Control
 
-COUNTING = Path(__file__).parents[1] / "laws" / "counting.py"
+COUNTING = Path(__file__).parents[2] / "laws" / "counting.py"
 #: control_period_s of three_tracks is 8 s
 PERIOD = 8
 

@@ -11,7 +11,7 @@ import pytest
 
 from trainctl.diff.sources import sumo_log, sumo_logs_in
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 #: What SUMO 1.28 writes and its own schemas do not know; and, of routes, the attributes of types and of vehicles.

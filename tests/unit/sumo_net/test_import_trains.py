@@ -13,7 +13,7 @@ from sumo_net.importing import Options, convert
 from sumo_net.spec import LineError
 from trainctl.scenario.tables import TrainType
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
+DATA = Path(__file__).resolve().parents[3].parent / "shared" / "data"
 REAL = [
     *sorted((DATA / "ttobench" / "trains").glob("*.json")),
     *(DATA / "trainruns" / f"{n}.yaml" for n in ("local", "longdistance", "train_schema_2022")),
