@@ -104,6 +104,7 @@ def metrics(run: Run, *, band_m: float = 1.0, speed_band: float = 0.02, section_
     inside = [float(event["value"]) for event in run.events if event["kind"] == "violation" and event.get("bound") == GAP]
     values |= traffic.of_trains(trains, section_m, inside)
     values |= punctuality.of_entries(run.events)
+    values |= punctuality.of_stops(run.stops, float(time.max()))
     try:
         values |= traffic.of_sumo(run.folder / "sumo")
     except InputError:

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from trainctl.errors import InputError
 from trainctl.runs.run import Run
 
-TABLES = ("trains", "units", "links")
+TABLES = ("trains", "units", "links", "stops")
 
 #: Rows read at once.
 ROWS = 1 << 16

@@ -32,6 +32,13 @@ class Stop(NamedTuple):
     name: str
     passing: float = 0.0  # m/s, it does not stand but passes with at most this speed; 0: it stands
     parks: bool = False  # it leaves the track meanwhile, and others pass
+    planned: float = math.nan  # s, arrival; NaN: none is planned
+    edge: str = ""  # the platform: where it stands
+
+    def late(self, arrival: float, departure: float = math.nan) -> float:
+        """How long after the plan a train leaves [s], or comes, where no departure is planned or none has been; NaN: no plan."""
+        leaves = departure - self.until
+        return leaves if math.isfinite(leaves) else arrival - self.planned
 
 
 class Roster(NamedTuple):
@@ -239,9 +246,9 @@ def _stops(departure: Departure, rails: Rails, way: Ints, begin: Floats, begin_s
             raise ValueError(f"stop on edge {stop.edge} at {stop.position_m:g} m: lies behind the departure or the stop before")
         row, last = row + int(ahead[0]), stop.position_m
         until = -math.inf if stop.until_s is None else stop.until_s - begin_s
-        found.append(
-            Stop(float(begin[row] + stop.position_m), stop.duration_s, until, stop.name or stop.edge, stop.pass_mps, stop.parks)
-        )
+        planned = math.nan if stop.arrival_s is None else stop.arrival_s - begin_s
+        place, name = float(begin[row] + stop.position_m), stop.name or stop.edge
+        found.append(Stop(place, stop.duration_s, until, name, stop.pass_mps, stop.parks, planned, stop.edge))
     return tuple(found)
 
 

@@ -12,6 +12,7 @@ from trainctl.railway import along, authority, interlocking, supervisor
 from trainctl.railway.authority import DRIVER_MARGIN_M, View
 from trainctl.railway.interlocking import Held
 from trainctl.railway.ways import Ways
+from trainctl.record.columns import Call
 from trainctl.scenario.model import Model
 from trainctl.scenario.roster import Stop
 from trainctl.signals import Bools, Floats, Ints, Seen
@@ -34,7 +35,9 @@ class State(NamedTuple):
     entering: Bools  # they come with the step to this instant, told when they are there
     left: Bools
     next_stop: Ints  # number of it in the roster
-    stands_until: Floats  # s, while a train stands at a stop, else NaN
+    stands_since: Floats  # s, while a train stands at a stop, else NaN
+    stands_until: Floats  # s, the same
+    late: Floats  # s, by how much a train was late where that was known last, NaN: not yet
     stopping: Bools  # for its next stop
     parked: Bools  # off the track, at a stop
     waits_for: Ints  # train that each is held by at a switch, -1 if none
@@ -67,6 +70,11 @@ def nothing(trains: int) -> Around:
     return Around((), (np.zeros(0, np.int64), np.zeros(0)), np.zeros(trains, bool), None, {}, None)
 
 
+def _late(delay: float) -> dict[str, float]:
+    """What an event says of a ``delay`` [s]; nothing where nothing was planned."""
+    return {} if np.isnan(delay) else {"delay_s": round(delay, 9)}
+
+
 class Traffic:
     """The traffic of a run."""
 
@@ -88,7 +96,8 @@ class Traffic:
         n = len(self.length)
         return State(
             came=np.full(n, self.roster.placed), entering=np.zeros(n, bool), left=np.zeros(n, bool),
-            next_stop=np.zeros(n, np.int64), stands_until=np.full(n, np.nan), stopping=np.zeros(n, bool), parked=np.zeros(n, bool),
+            next_stop=np.zeros(n, np.int64), stands_since=np.full(n, np.nan), stands_until=np.full(n, np.nan),
+            late=np.full(n, np.nan), stopping=np.zeros(n, bool), parked=np.zeros(n, bool),
             waits_for=np.full(n, -1), requests=interlocking.none(),
         )  # fmt: skip
 
@@ -107,6 +116,8 @@ class Traffic:
             self.journal.event(t, "given_up", train=self.p.scenario.ids[i], planned_s=float(self.roster.depart[i]))
         s, stops, soon = self._stops(t, seen, speed, overrun, s)
         later = t + self.step_s
+        if last:
+            self._uncalled(s)
         asking, reach = [] if last else [*self._returning(later, s), *self.due(later, s)], self._reach(speed)
         s, held, entries, kept_out = self.entering(t, ways, s.on_track(seen), speed, s, asking, reach)
         present = s.on_track(seen).present.copy()
@@ -122,7 +133,7 @@ class Traffic:
         if not gone.any():
             return s
         for i in np.flatnonzero(gone).tolist():
-            self.journal.event(t, "arrive", train=self.p.scenario.ids[i])
+            self.journal.event(t, "arrive", train=self.p.scenario.ids[i], **_late(float(s.late[i])))
         return s._replace(left=s.left | gone)
 
     def departures(self, t: float, seen: Seen, speed: Floats, s: State) -> State:
@@ -258,7 +269,8 @@ class Traffic:
             return s, nothing(n).stops, np.zeros(n, bool)
         standing = s.standing
         s = s._replace(
-            next_stop=s.next_stop.copy(), stands_until=s.stands_until.copy(), stopping=s.stopping.copy(), parked=s.parked.copy()
+            next_stop=s.next_stop.copy(), stands_since=s.stands_since.copy(), stands_until=s.stands_until.copy(),
+            late=s.late.copy(), stopping=s.stopping.copy(), parked=s.parked.copy(),
         )  # fmt: skip
         for i in np.flatnonzero(seen.present & (s.next_stop < self.stops_of)).tolist():
             stop = self.stop_of(i, s)
@@ -267,25 +279,28 @@ class Traffic:
             if standing[i]:
                 if t < s.stands_until[i] - 1e-9 or s.parked[i]:
                     continue
-                s.stands_until[i] = np.nan
-                s.next_stop[i] += 1
-                self.journal.event(t, "stop_left", train=self.p.scenario.ids[i], stop=stop.name)
+                late = self._called(i, stop, float(s.stands_since[i]), t, int(seen.edge[i]), s)
+                self.journal.event(t, "stop_left", train=self.p.scenario.ids[i], stop=stop.name, **_late(late))
+                s.stands_since[i] = s.stands_until[i] = np.nan
                 stop = self.stop_of(i, s)
                 if stop is None:
                     s.stopping[i] = False
                     continue
                 room = stop.place - float(seen.position[i])
             while stop is not None and stop.passing and room <= 0.0:
-                self.journal.event(t, "waypoint", train=self.p.scenario.ids[i], stop=stop.name, speed_mps=float(speed[i]))
-                s.next_stop[i] += 1
+                late = self._called(i, stop, t, t, int(seen.edge[i]), s)
+                self.journal.event(
+                    t, "waypoint", train=self.p.scenario.ids[i], stop=stop.name, speed_mps=float(speed[i]), **_late(late)
+                )  # fmt: skip
                 stop = self.stop_of(i, s)
                 room = stop.place - float(seen.position[i]) if stop is not None else np.inf
             if stop is None:
                 s.stopping[i] = False
                 continue
             if not stop.passing and speed[i] < STANDS_MPS and room < STOP_BAND_M:
-                s.stands_until[i] = max(t + stop.duration, stop.until)
-                self.journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=room)
+                s.stands_since[i], s.stands_until[i] = t, max(t + stop.duration, stop.until)
+                late = t - stop.planned
+                self.journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=room, **_late(late))
                 s.parked[i] = stop.parks
                 continue
             trains.append(i)
@@ -298,6 +313,21 @@ class Traffic:
         soon[found] = room_to < braking + SOON_S * speed[found]
         stopping = (s.stopping & seen.present | near) & (near | s.standing)
         return s._replace(stopping=stopping), (found, room_to), soon | near
+
+    def _called(self, i: int, stop: Stop, arrival: float, departure: float, edge: int, s: State) -> float:
+        """Record a stop that is done with, and turn to the next; how late the train is [s], NaN: nothing was planned."""
+        self.journal.call(i, Call(stop, int(s.next_stop[i]) + 1, arrival, departure), edge)
+        s.next_stop[i] += 1
+        late = stop.late(arrival, departure)
+        s.late[i] = s.late[i] if np.isnan(late) else late
+        return late
+
+    def _uncalled(self, s: State) -> None:
+        """Record the stops that trains have not left when the run ends."""
+        for i, stops in enumerate(self.roster.stops):
+            for k in range(int(s.next_stop[i]), len(stops)):
+                here = float(s.stands_since[i]) if k == s.next_stop[i] else np.nan
+                self.journal.call(i, Call(stops[k], k + 1, here, np.nan), self.p.rails.index[stops[k].edge])
 
     # Turns, and what is ahead
 

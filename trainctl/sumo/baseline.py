@@ -15,7 +15,7 @@ from trainctl.railway.ways import ways
 from trainctl.scenario.model import Model
 from trainctl.signals import Bools, Floats, Ints, Observed, Seen
 from trainctl.sumo.baseline_files import departures, verify_signals, write_configuration, write_routes
-from trainctl.sumo.session import TOLERANCE_M, Session
+from trainctl.sumo.session import LOGS, TOLERANCE_M, Session
 
 #: How far ahead SUMO is asked for the next train on a net [m].
 LOOK_M = 20_000.0
@@ -44,6 +44,8 @@ class Baseline(Session):
         super().__init__(line, net, folder, run.step_s, run.steps, run.record_every_s)
         verify_signals(p)
         self.p, self.ids, self.departures = p, p.scenario.ids, departures(p)
+        if any(d.stops for d in self.departures):
+            self.logs = LOGS | {"stop-output": "stops.xml"}
         self.number = {name: i for i, name in enumerate(self.ids)}
         self.length = p.consists.train_length()
         self.track = np.array([line.track_ids.index(t) for t in line.tracks], np.int64)
