@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trainctl.monitors import waiting
-from trainctl.railway import along, authority, interlocking, supervisor
+from trainctl.railway import along, authority, interlocking, supervisor, zones
 from trainctl.railway.authority import DRIVER_MARGIN_M, View
 from trainctl.railway.interlocking import Held
 from trainctl.railway.ways import Ways
@@ -232,9 +232,9 @@ class Traffic:
         behind = view.targets.other == i
         if not behind.any():
             return False
-        asked = authority.of(view.targets, behind)
-        seen = supervisor.verdict(
-            self.rules, trial, asked, supervisor.no_limits(), self.step_s, self.theta, self.assumed, np.zeros(len(speed))
+        asked, clear = authority.of(view.targets, behind), authority.of(view.clear, view.clear.other == i)
+        seen = authority.judge(
+            self.rules, trial, asked, clear, supervisor.no_limits(), self.step_s, self.theta, self.assumed, np.zeros(len(speed))
         )
         return bool(np.any(seen.emergency[view.targets.train[behind]]))
 
@@ -338,13 +338,21 @@ class Traffic:
         braking = supervisor.stopping_distance(v, self.requesting, self.step_s, self.theta)
         return braking + 4.0 * v * self.step_s + rules.margin_m + 2.0 * DRIVER_MARGIN_M + 50.0 + 6.0 * assumed.uncertainty
 
+    def _own_stops(self, s: State) -> Floats:
+        """Where every train is to stand next [m], shape (n,); inf: nowhere."""
+        places = np.full(len(self.length), np.inf)
+        for i in np.flatnonzero(s.came & ~s.left & (s.next_stop < self.stops_of)).tolist():
+            stop = self.stop_of(i, s)
+            places[i] = np.inf if stop is None or stop.passing else stop.place
+        return places
+
     def _request(self, t: float, ways: Ways, seen: Seen, reach: Floats, entering: Bools, s: State) -> tuple[State, Held]:
         """Let every train request what lies within its reach; ``entering`` (n,) are those that ask to enter the net."""
         if self.ways is not ways:  # they changed
-            self.ways, self.zones = ways, interlocking.zones(ways, self.net)
+            self.ways, self.zones = ways, zones.of(ways, self.net)
         requests, held, said = interlocking.request(
             self.zones, s.requests, seen.row, seen.position, self.length, seen.present, reach,
-            self.p.supervision.margin_m + DRIVER_MARGIN_M, entering,
+            self.p.supervision.margin_m + DRIVER_MARGIN_M, entering, self._own_stops(s), s.standing,
         )  # fmt: skip
         ids, edges = self.p.scenario.ids, self.p.rails.edges
         for one in said:
