@@ -21,6 +21,7 @@ from sumo import SUMO_HOME
 from trainctl.diff.findings import CAUSES
 from trainctl.diff.sources import KINDS
 from trainctl.runner import run
+from trainctl.runs.kinds import Kind
 from trainctl.scenario.build import open_scenario
 
 PAGE = Path(__file__).resolve().parent.parent / "trainctl" / "diff" / "README.md"
@@ -35,22 +36,48 @@ ENDINGS = {
 
 #: Units of SUMO's attributes that are no times, by the words they begin or end with; the first that fits.
 UNITS = (
-    (r"speedFactor|.*[Rr]elative|.*Factor|occupancy|share", "1"),
-    (r"(.*_)?(x|y|z|.*[Pp]os(Lat)?|.*[Ll]ength|.*[Dd]istance|odometer|.*Gap|.*(Front|Back)|overlap.*)", "m"),
+    (r"speedFactor|.*[Rr]elative|.*Factor|share", "1"), (r"occupancy", "%"), (r"flow", "1/h"), (r".*[Dd]ensity", "1/km"),
+    (r"electricity_normed", "Wh/(km h)"), (r".*_normed", "g/(km h)"), (r"electricity_perVeh", "Wh"), (r".*_perVeh", "mg"),
+    (r"(.*_)?(x|y|z|.*[Pp]os(Lat)?|.*[Ll]ength|.*[Dd]istance|odometer|.*Gap|.*(Front|Back))", "m"),
     (r".*[Aa]cceleration(Lat)?|.*[Dd]ecel", "m/s2"),
     (r".*[Ss]peed(Lat)?", "m/s"),
     (r"angle|slope", "deg"),
     (r".*(CO|CO2|HC|PMx|NOx|fuel)_abs", "mg"), (r".*electricity_abs", "Wh"),
     (r"CO|CO2|HC|PMx|NOx|fuel", "mg/s"), (r"electricity", "Wh/s"), (r"noise", "dB"),
     (r".*(actualBatteryCapacity|totalEnergyConsumed|totalEnergyRegenerated|energy.*)", "Wh"),
-    (r".*[Dd]ensity", "1/km"), (r".*(flow|entered|left|departed|arrived).*", "1"),
     (r"meanTravelTime|meanWaitingTime|.*[Tt]ime.*|.*[Dd]uration|.*[Dd]elay.*|traveltime|sampledSeconds|.*Loss", "s"),
 )  # fmt: skip
 
-#: What SUMO writes for vehicles' routes: its schema is that of all it reads.
-VEHROUTE = {
-    "id": ("", "text"), "type": ("", "text"), "depart": ("s", "number"), "departLane": ("", "text"), "departPos": ("m", "text"),
-    "departSpeed": ("m/s", "text"), "arrival": ("s", "number"), "route_edges": ("", "text"), "route_exitTimes": ("s", "text"),
+#: Columns around the rows.
+AROUND = {"time": ("s", "number"), "begin": ("s", "number"), "end": ("s", "number"), "interval_id": ("", "text"),
+          "edge_id": ("", "text")}  # fmt: skip
+
+#: Columns that the schemas do not know, or of which their types tell too little: by log, "name unit type".
+BESIDES = {
+    "emission": ("waiting s number",),
+    "summary": ("discarded 1 number", "duration ms number"),
+    "personsummary": ("discarded 1 number", "duration ms number"),
+    "stops": ("started s number",),
+    # the schema of routes is that of all that is read
+    "vehroute": (
+        "id - text", "type - text", "depart s number", "departLane - text", "departPos m text", "departSpeed m/s text",
+        "arrival s number", "route_edges - text", "route_exitTimes s text", "stop_lane - text", "stop_endPos m number",
+        "stop_duration s number", "stop_started s number", "stop_ended s number", "walk_edges - text", "walk_exitTimes s text",
+        "walk_started s number", "walk_ended s number",
+    ),
+    # there is none
+    "ssm": (
+        "ego - text", "foe - text", "begin s number", "end s number", "timeSpan_values s text",
+        *(f"{name}Span_values {unit} text" for name, unit in (
+            ("BR", "m/s2"), ("SGAP", "m"), ("TGAP", "s"), ("TTC", "s"), ("DRAC", "m/s2"), ("PPET", "s"), ("MDRAC", "m/s2"),
+            ("type", "1"),
+        )),
+        *(f"{name}_{rest}" for name, unit, last in (
+            ("maxBR", "m/s2", ()), ("minSGAP", "m", ("leader - text",)), ("minTGAP", "s", ("leader - text",)),
+            *((conflict, unit, ("type 1 number", "speed m/s number")) for conflict, unit in (
+                ("minTTC", "s"), ("maxDRAC", "m/s2"), ("PET", "s"), ("minPPET", "s"), ("maxMDRAC", "m/s2"))),
+        ) for rest in ("time s number", "position m text", f"value {unit} number", *last)),
+    ),
 }  # fmt: skip
 
 
@@ -76,56 +103,67 @@ def unit_of(name: str, typed: str) -> str:
     return next((unit for pattern, unit in UNITS if re.fullmatch(pattern, name)), "1")
 
 
-def of_schema(root: str, rows: tuple[str, ...], name: str) -> list[tuple[str, str, str]]:
+def of_schema(kind: Kind) -> list[tuple[str, str, str]]:
     """Columns of one of SUMO's logs: attributes of its rows, and of the elements in them with their names in front."""
-    if name == "vehroute":
-        return [(column, *rest) for column, rest in VEHROUTE.items()]
-    for path in sorted(SCHEMAS.glob("*_file.xsd")):
-        schema = ET.parse(path).getroot()
-        if any(element.get("name") == root for element in schema.findall(f"{XSD}element")):
-            break
-    else:
-        return []
+    out = {column: AROUND[column] for columns in kind.around.values() for column in columns.values()}
+    out |= _in_schema(kind)
+    for text in BESIDES.get(kind.name, ()):
+        column, unit, typed = text.split(" ")
+        out[column] = (unit.replace("-", ""), typed)
+    return [(column, *rest) for column, rest in out.items()]
+
+
+def _in_schema(kind: Kind) -> dict[str, tuple[str, str]]:
+    if kind.name in ("vehroute", "ssm"):
+        return {}
+    schemas = map(_whole, sorted(SCHEMAS.glob("*_file.xsd")))
+    schema = next(s for s in schemas if any(e.get("name") == kind.root for e in s.findall(f"{XSD}element")))
     every = {e.get("name"): e for e in schema.iter(f"{XSD}element") if e.get("name")}
     types = {e.get("name"): e for e in schema.iter(f"{XSD}complexType") if e.get("name")}
+    rows = {row for other in KINDS if other.root == kind.root for row in other.rows}
     out: dict[str, tuple[str, str]] = {}
-    if name == "fcd":
-        out["time"] = ("s", "number")
 
     def attributes(element: ET.Element, front: str, depth: int) -> Iterator[tuple[str, str]]:
         body = types.get(element.get("type"), element)
-        for attribute in _own(body):
+        for attribute in _own(body, types):
             yield f"{front}{attribute.get('name')}", attribute.get("type") or "xsd:string"
         for child in body.iter(f"{XSD}element"):
             inner = every.get(child.get("ref") or child.get("name"))
-            if inner is not None and inner is not element and depth < 2 and inner.get("name") != "example_device":
-                yield from attributes(inner, f"{inner.get('name')}_", depth + 1)
+            if inner is None or inner is element or depth == 2 or inner.get("name") in {"example_device", *rows}:
+                continue
+            yield from attributes(inner, f"{inner.get('name')}_", depth + 1)
 
-    for row in rows:
+    for row in kind.rows:
         if row in every:
             for column, typed in attributes(every[row], "", 0):
                 text = typed.startswith(("xsd:string", "position")) and not column.endswith("Speed")
                 unit = unit_of(column, typed)
                 out.setdefault(column, ("" if text and unit == "1" else unit, "text" if text else "number"))
-    return [(column, *rest) for column, rest in out.items()]
+    return out
 
 
-def _own(body: ET.Element) -> Iterator[ET.Element]:
+def _whole(path: Path) -> ET.Element:
+    """A schema with what it includes."""
+    schema = ET.parse(path).getroot()
+    for include in schema.findall(f"{XSD}include"):
+        schema.extend(_whole(path.parent / include.attrib["schemaLocation"]))
+    return schema
+
+
+def _own(body: ET.Element, types: dict[str | None, ET.Element]) -> Iterator[ET.Element]:
     """Attributes of an element, not of those in it."""
     for child in body:
         if child.tag == f"{XSD}attribute":
             yield child
         elif child.tag != f"{XSD}element":
-            for inner in child:
-                if inner.tag == f"{XSD}attribute":
-                    yield inner
-                elif inner.tag in (f"{XSD}extension", f"{XSD}restriction"):
-                    yield from _own(inner)
+            if child.get("base") in types:
+                yield from _own(types[child.get("base")], types)
+            yield from _own(child, types)
 
 
 def tables() -> str:
     """All tables as Markdown."""
-    found = ours() | {kind.name: of_schema(kind.root, kind.rows, kind.name) for kind in KINDS}
+    found = ours() | {kind.name: of_schema(kind) for kind in KINDS}
     out = []
     for table, columns in found.items():
         where = "a run folder's" if table in ("trains", "units", "links", "events") else "SUMO's"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import html
 import tempfile
+import warnings
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import cached_property
@@ -25,6 +26,7 @@ from pydantic import ValidationError
 
 from trainctl import runner
 from trainctl.errors import InputError
+from trainctl.record.folder import place_for, run_name
 from trainctl.runner import Backend
 from trainctl.runs import run as recorded
 from trainctl.runs.outcome import summary
@@ -66,7 +68,8 @@ def run(
     backend : {"sumo", "numeric"}
         SUMO, or the same loop without a simulator.
     out : Path, optional
-        Run folder; default ``runs/NAME``. A run of ours there is replaced.
+        Run folder; default ``runs/NAME``, with settings ``runs/NAME+KEY=VALUE``. A run there is replaced, unless more than a run
+        lies there: by default it then goes to ``NAME-2``.
     force : bool
         Replace whatever lies there.
     progress : callable, optional
@@ -86,7 +89,12 @@ def run(
     TrainctlError
         The run failed.
     """
-    folder = Path("runs") / Path(scenario).stem if out is None else Path(out)
+    if out is None:
+        folder, elsewhere = place_for(Path("runs") / run_name(scenario, [f"{key}={value}" for key, value in settings.items()]))
+        if elsewhere:
+            warnings.warn(elsewhere, stacklevel=2)
+    else:
+        folder = Path(out)
     runner.run(open_scenario(str(scenario), settings), folder, backend, force, ("trainctl.run",), progress)
     return Run(folder)
 

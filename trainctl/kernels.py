@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import os
-from functools import partial
+import tempfile
+import warnings
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,31 @@ def _load_index(file: Any, load: Any = Index._load_index) -> Any:
 Index._load_index = _load_index
 
 
+@cache
+def _base() -> Path:
+    """A folder for kernels that can be written: the user's cache, else one in the folder for temporary files.
+
+    What is kept there is run, so a folder that somebody else could have written into is not taken.
+    """
+    try:
+        places = [Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "trainctl"]
+    except RuntimeError:  # a user without a home
+        places = []
+    places.append(Path(tempfile.gettempdir()) / f"trainctl-{os.getuid()}")
+    for place in places:
+        try:
+            place.mkdir(mode=0o700, parents=True, exist_ok=True)
+            about = place.stat()
+            shared = place is places[-1] and (about.st_uid != os.getuid() or about.st_mode & 0o022)
+            if os.access(place, os.W_OK | os.X_OK) and not shared:
+                return place
+        except OSError:
+            continue
+    place = Path(tempfile.mkdtemp(prefix="trainctl-"))
+    warnings.warn(f"no folder of yours to keep compiled code in ({places[0]}): it is compiled anew in {place}", stacklevel=2)
+    return place
+
+
 def keep_by_sources() -> None:
     """Point numba's cache at a folder of this version of the sources, unless NUMBA_CACHE_DIR says otherwise."""
     if os.environ.get("NUMBA_CACHE_DIR"):
@@ -45,5 +72,4 @@ def keep_by_sources() -> None:
     compiled = [p for part in ("plants", "controllers", "observers", "topology", "railway") for p in (here / part).glob("*.py")]
     for path in sorted([*(here / f"{name}.py" for name in ("signals", "davis", "draws", "kernels")), *compiled]):
         digest.update(path.read_bytes())
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    config.CACHE_DIR = str(base / "trainctl" / f"kernels-{digest.hexdigest()[:16]}")
+    config.CACHE_DIR = str(_base() / f"kernels-{digest.hexdigest()[:16]}")

@@ -36,6 +36,7 @@ from trainctl.record.folder import (
     remove,
     write_info,
     write_json,
+    written,
 )  # fmt: skip
 from trainctl.runs.run import Run
 from trainctl.scenario import promise, roster
@@ -133,6 +134,8 @@ def _opened(
         raise InputError(f"--checkpoint-every {every:g}: must be a multiple of step_s = {step:g}")
     if every is not None and gui is not None:
         raise InputError("--checkpoint-every: a run that is watched cannot be resumed; leave out --gui")
+    if backend == "sumo" and "," in (place := str(Path(out).absolute())):
+        raise InputError(f"{place}: SUMO takes a comma for the end of a file's name: choose an --out without, or --backend numeric")
     partial = open_partial(out, force)
     with held(partial):
         text = p.scenario.toml()
@@ -271,7 +274,8 @@ def _complete(p: Model, partial: Path, info: dict[str, Any], done: dict[str, Any
     if journal is None:
         Journal(partial, p, done["recorder"]).close()
     write_json(partial / "metrics.json", metrics(Run(partial)))
-    write_info(partial, {**info, **done["end"], "status": "complete", "wall_time_s": done["wall_time_s"]})
+    files = [path for path in written(partial) if not path.startswith(f"{checkpoint.FOLDER}/")]
+    write_info(partial, {**info, **done["end"], "status": "complete", "wall_time_s": done["wall_time_s"], "files": files})
     remove(partial / checkpoint.FOLDER)
 
 

@@ -27,6 +27,9 @@ def written(finished, tmp_path_factory):
     a, b = mutations.write(frame, place / "a.xml"), mutations.write(other, place / "<b>&.xml")
     told = parse_tolerances({"absolute": 1.0, "time_s": 5.0})
     (place / "page.html").write_text(page(diff(a, b, told)), encoding="utf-8")
+    how = {"run.duration_s": 40}
+    runs = [finished("three_tracks", "numeric", **how, **{"controller.eta": eta}) for eta in ("own_speed", "printed")]
+    (place / "runs.html").write_text(page(diff(*(run.folder for run in runs))), encoding="utf-8")
     (place / "same.html").write_text(page(diff(a, a)), encoding="utf-8")
     return place
 
@@ -46,6 +49,19 @@ def test_no_console_error_no_request_and_every_curve(written, dark, tmp_path):
         assert all(all(drawn) for drawn in plots)
         assert browser.run("return document.body.scrollWidth <= window.innerWidth")
         browser.screenshot(tmp_path / "page.png")
+
+
+@pytest.mark.parametrize("name", ["page", "runs"])
+def test_numbers_stay_readable_on_a_small_screen(written, name):
+    with Browser(width=500) as browser:
+        browser.open(written / f"{name}.html")
+        browser.until("return document.documentElement.dataset.ready === 'yes'")
+        assert browser.run("return document.documentElement.scrollWidth <= window.innerWidth")
+        sizes = browser.run(
+            "return [...document.querySelectorAll('svg')].map(s => s.getBoundingClientRect().width / s.viewBox.baseVal.width)"
+        )
+        assert sizes
+        assert min(sizes) * 11 > 8.5  # letters [px]
 
 
 def test_the_cursor_says_both_values_and_the_tube(written):

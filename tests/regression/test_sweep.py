@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pandas as pd
@@ -15,7 +16,7 @@ import psutil
 import pytest
 
 from trainctl.studies.results import write_results
-from trainctl.studies.sweep import SweepPlan, jobs, ready_made, simulate
+from trainctl.studies.sweep import SweepPlan, jobs, ready_made, simulate, sweep
 
 BIN = Path(sys.executable).parent
 SEEDS, DURATION = range(8), 300
@@ -88,3 +89,17 @@ def test_a_separate_scheduler_gives_the_dataset_of_the_local_cluster(alone, tmp_
     far, near = ((tmp_path / name / "results.parquet").read_bytes() for name in ("far", "near"))
     assert far == near == alone
     assert len(pd.read_parquet(tmp_path / "far" / "results.parquet")) == len(SEEDS)
+
+
+def test_a_sweep_listens_on_the_loopback_alone(tmp_path):
+    """No port of scheduler, dashboard or workers can be reached from another machine."""
+    heard = set()
+
+    def look(*_):
+        for process in (psutil.Process(), *psutil.Process().children(recursive=True)):
+            with suppress(psutil.Error):
+                heard.update(c.laddr.ip for c in process.net_connections("inet") if c.status == psutil.CONN_LISTEN)
+
+    plan = SweepPlan("fully_distributed", {"run.duration_s": [20]}, [0, 1], {}, "numeric")
+    assert sweep(plan, tmp_path / "s", workers=1, progress=look)["complete"] == 2
+    assert heard == {"127.0.0.1"}

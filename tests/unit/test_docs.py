@@ -39,7 +39,7 @@ PAGES = (
 
 #: Line of a page -> (what is executed instead, why). None: not executed.
 REPLACED: dict[str, tuple[str | None, str]] = {
-    "make run": ("trainctl run --set run.duration_s=24", "2400 s take half a minute; making .venv needs a package index"),
+    "make run": ("trainctl run --set run.duration_s=24 --out runs/three_tracks", "2400 s take half a minute; making .venv needs a package index"),
     "make test": (None, "this is the test suite"),
     "trainctl plot runs/three_tracks": ("trainctl plot runs/three_tracks --out figures", "to see that it writes"),
     "trainctl run fully_distributed --backend numeric": (

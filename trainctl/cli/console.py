@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import glob
 import json
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +21,12 @@ if TYPE_CHECKING:
     from trainctl.scenario.model import Model
 
 DEFAULT_SCENARIO = "three_tracks"
+
+#: Columns that a table may take where nobody reads it on a screen: what it needs, no cell is wrapped.
+PIPED = 1000
+
+#: Smaller numbers are shown as 0.
+ROUNDING = 1e-9
 
 #: Control characters but tab and newline, and how they are shown.
 STEERING = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\t\n"}
@@ -39,11 +47,53 @@ networks = typer.Typer(help="Rail networks: list, build, show.", no_args_is_help
 app.add_typer(networks, name="net")
 
 
-ScenarioName = Annotated[str, typer.Argument(help="Name of a shipped scenario (see `trainctl list`) or path of a scenario TOML.")]
-RunFolder = Annotated[Path, typer.Argument(help="Run folder, as `trainctl run` made it.")]
+def scenario_names(typed: str) -> list[str]:
+    """Scenarios that begin like that: shipped ones, and files here."""
+    from trainctl.scenario.reading import shipped
+
+    return [name for name in shipped() if name.startswith(typed)] + paths(typed, ".toml")
+
+
+def run_folders(typed: str) -> list[str]:
+    """Run folders that begin like that."""
+    from trainctl.record.folder import INFO
+
+    places = [*Path(".").glob("*/"), *Path("runs").glob("*/"), *Path(".").glob(f"{typed}*/")]
+    return sorted({str(place) for place in places if str(place).startswith(typed) and (place / INFO).is_file()})
+
+
+def paths(typed: str, suffix: str) -> list[str]:
+    """Files that begin like that, and folders to look in."""
+    found = sorted(Path(".").glob(f"{glob.escape(typed)}*"))
+    return [f"{path}/" if path.is_dir() else str(path) for path in found if path.is_dir() or path.suffix == suffix]
+
+
+def settable(typed: str) -> list[str]:
+    """Keys of a scenario that begin like that, as ``--set`` takes them."""
+    from trainctl.scenario.tables import Scenario
+
+    tables = Scenario.model_json_schema()
+    found = []
+    for table, about in tables["properties"].items():
+        named = [part.get("$ref", "") for part in (about, *about.get("anyOf", ()))]
+        keys = [key for ref in named if ref for key in tables["$defs"][ref.rpartition("/")[2]].get("properties", {})]
+        found += [f"{table}.{key}=" for key in keys]
+    return [key for key in found if key.startswith(typed)]
+
+
+ScenarioName = Annotated[
+    str,
+    typer.Argument(
+        help="Name of a shipped scenario (see `trainctl list`) or path of a scenario TOML.", autocompletion=scenario_names
+    ),
+]
+RunFolder = Annotated[Path, typer.Argument(help="Run folder, as `trainctl run` made it.", autocompletion=run_folders)]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")]
 Settings = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key, e.g. --set run.duration_s=60. Repeatable.")
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Override a key, e.g. --set run.duration_s=60. Repeatable.", autocompletion=settable
+    ),
 ]
 
 
@@ -78,6 +128,21 @@ def listing(title: str | None, *columns: str) -> Table:
     return table
 
 
+def number(value: Any) -> str:
+    """A number for people: four significant digits, 0 for what is rounding (``--json`` has all); text as it is, "-" for nothing."""
+    if value is None:
+        return "-"
+    if not isinstance(value, float) or not math.isfinite(value):
+        return str(value)
+    if abs(value) < ROUNDING:
+        return "0"
+    digits = 3 - math.floor(math.log10(abs(value)))
+    if not -4 <= digits <= 7:
+        return f"{value:.3e}"
+    text = f"{round(value, digits):.{max(digits, 0)}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
 def visible(text: str) -> str:
     """Text as it is written: characters that steer a terminal, which titles and ids may hold, are shown as hexadecimal escapes."""
     return text.translate(STEERING)
@@ -97,8 +162,8 @@ def show(table: Table) -> None:
     """Print a table. What stands in its cells is text, not markup."""
     from rich.console import Console
 
-    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False, markup=False, emoji=False)
-    console.print(table)
+    width = None if sys.stdout.isatty() else PIPED
+    Console(width=width, highlight=False, markup=False, emoji=False).print(table)
 
 
 def show_json(value: Any) -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from trainctl.errors import InputError
+from trainctl.errors import InputError, printable
 
 if TYPE_CHECKING:
     from trainctl.diff.runs import Report, Tolerances
@@ -26,7 +27,9 @@ InTime = Annotated[
     float | None, typer.Option("--time-tolerance", metavar="S", help="Tolerance in time of every column and of rows, in seconds.")
 ]
 Zero = Annotated[bool, typer.Option("--zero", help="No tolerance: --tolerance 0.")]
-Form = Annotated[Literal["text", "json", "github"], typer.Option("--format", help="A table, JSON, or annotations for GitHub.")]
+Form = Annotated[
+    Literal["text", "json", "github"] | None, typer.Option("--format", help="Text (the default), JSON, or annotations for GitHub.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for machines: --format json.")]
 Rows = Annotated[bool, typer.Option("--rows", help=f"Also the rows behind each finding ({ROWS} each), and every column.")]
 Junit = Annotated[Path | None, typer.Option(metavar="FILE", help="Also write JUnit XML: a test case for every column.")]
@@ -44,21 +47,21 @@ def register(app: typer.Typer) -> None:
         tolerance: Absolute = None,
         time_tolerance: InTime = None,
         zero: Zero = False,
-        form: Form = "text",
+        form: Form = None,
         as_json: AsJson = False,
         rows: Rows = False,
         junit: Junit = None,
         html: Html = None,
         accept: Annotated[bool, typer.Option("--accept", help="Put B in the place of A, after showing what moves.")] = False,
     ) -> None:
-        """Compare two runs or two of SUMO's logs (XML, CSV, Parquet, gzipped or not): exit 1 if they differ.
+        """Compare two runs or two of SUMO's logs (XML and CSV, gzipped or not, and Parquet): exit 1 if they differ.
 
         Differences are grouped by train and cause. Rows are matched by time and train; with a tolerance in time a value must lie in
-        the tube round the reference. Versions are told but are no difference; SUMO's headers, clocks and durations are not
+        the tube round the reference. Versions are noted but are no difference; SUMO's headers, clocks and durations are not
         compared. Without options values may differ by 1e-6, or by one in the last decimal of a log.
         """
-        chosen = chosen_tolerances(tolerances, 0.0 if zero else tolerance, time_tolerance)
-        compared(a, b, chosen, "json" if as_json else form, rows, junit, html, accept)
+        chosen = chosen_tolerances(tolerances, tolerance, time_tolerance, zero)
+        compared(a, b, chosen, chosen_form(form, as_json, rows), rows, junit, html, accept)
 
 
 def compared(
@@ -73,8 +76,14 @@ def compared(
     report = compare(a, b, tolerances)
     if form == "json":
         from trainctl.cli.console import show_json
+        from trainctl.diff.behind import rows_behind
+        from trainctl.record.folder import plain
 
-        show_json(report.as_dict())
+        found = report.as_dict()
+        for finding, shown in zip(report.findings, found["findings"], strict=True):
+            behind = rows_behind(finding, report.tables, report.tolerances, ROWS) if rows else []
+            shown.update({"behind": [plain(row._asdict()) for row in behind]} if rows else {})
+        show_json(found)
     elif form == "github":
         print("\n".join(github(report)))
     else:
@@ -94,7 +103,16 @@ def compared(
         raise typer.Exit(1)
 
 
-def chosen_tolerances(file: Path | None, absolute: float | None, time_s: float | None) -> Tolerances:
+def chosen_form(form: str | None, as_json: bool, rows: bool) -> str:
+    """The form that was asked for."""
+    if rows and form == "github":
+        raise InputError("--rows, --format github: give one of them: annotations hold no rows")
+    if as_json and form not in (None, "json"):
+        raise InputError(f"--json, --format {form}: give one of them")
+    return "json" if as_json else form or "text"
+
+
+def chosen_tolerances(file: Path | None, absolute: float | None, time_s: float | None, zero: bool) -> Tolerances:
     """Tolerances of a file, and what the options say instead."""
     from dataclasses import replace
 
@@ -106,8 +124,11 @@ def chosen_tolerances(file: Path | None, absolute: float | None, time_s: float |
         for name, value in (("--tolerance", absolute), ("--time-tolerance", time_s))
         if value is not None and not 0 <= value < float("inf")
     ]
+    if zero and absolute is not None:
+        wrong.append("--zero, --tolerance: give one of them")
     if wrong:
         raise InputError(wrong)
+    absolute = 0.0 if zero else absolute
     if time_s is not None:
         old, new = ({name: getattr(time, name) for name in TIMES} for time in (found.time, Tolerance(0.0, time_s=time_s)))
         # columns with a word of their own on time keep it
@@ -121,30 +142,34 @@ def chosen_tolerances(file: Path | None, absolute: float | None, time_s: float |
 
 
 def _show(report: Report, rows: bool) -> None:
-    from trainctl.diff.behind import rows_behind
-    from trainctl.diff.runs import told
-
-    for note in report.notes:
-        print(f"note: {note}")
-    count = sum(t.rows for t in report.tables)
-    if report.same:
-        print(f"no difference in {count} rows of {', '.join(t.table for t in report.tables)}")
-        return
-    if report.first:
-        print(f"first difference: {report.first}")
-    print(f"{len(report.findings)} finding{'s' if len(report.findings) > 1 else ''} in {count} compared rows:")
-    for number, f in enumerate(report.findings, 1):
-        print(f"{number:3}. {f.words}{f'  [{f.where}]' if f.where else ''}")
-        for label, d in (("first", f.first), ("most", f.largest)):
-            if d is not None:
-                time = "" if d.place.time_s is None else f"{d.place.time_s:.10g} s, "
-                print(f"       {label}: {time}{d.place.who}: {d.column} {told(d.place)}".replace(", : ", ": "))
-        for row in rows_behind(f, report.tables, report.tolerances, ROWS) if rows else ():
-            time = "" if row.time_s is None else f"{row.time_s:.10g} s, "
-            what = f"{row.column} {row.a} -> {row.b}" if row.column else f"row only in {'A' if row.a else 'B'}"
-            print(f"       {row.table}: {time}{row.who}: {what}")
+    for line in _lines(report, rows):
+        print(printable(line))
     if rows:
         _columns(report)
+
+
+def _lines(report: Report, rows: bool) -> Iterator[str]:
+    from trainctl.diff.behind import rows_behind
+    from trainctl.diff.findings import counted
+    from trainctl.diff.runs import at, told, value_told
+
+    yield from (f"note: {note}" for note in report.notes)
+    count = sum(t.rows for t in report.tables)
+    if report.same:
+        yield f"no difference in {counted(count, 'row')} of {', '.join(t.table for t in report.tables)}"
+        return
+    if report.first:
+        yield f"first difference: {report.first}"
+    yield f"{counted(len(report.findings), 'finding')} in {count} compared rows:"
+    for number, f in enumerate(report.findings, 1):
+        yield f"{number:3}. {f.words}{f'  [{f.where}]' if f.where else ''}"
+        for label, d in (("first", f.first), ("most", f.largest)):
+            if d is not None:
+                yield f"       {label}: {at(d.place.time_s, d.place.who)}: {d.column} {told(d.place)}"
+        for row in rows_behind(f, report.tables, report.tolerances, ROWS) if rows else ():
+            values = f"{row.column} {value_told(row.a)} -> {value_told(row.b)}"
+            what = values if row.column else f"row only in {'A' if row.a else 'B'}"
+            yield f"       {row.table}: {at(row.time_s, row.who)}: {what}"
 
 
 def _columns(report: Report) -> None:

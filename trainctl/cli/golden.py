@@ -7,7 +7,20 @@ from typing import Annotated
 
 import typer
 
-from trainctl.cli.diff import Absolute, AsJson, Form, Html, InTime, Junit, Rows, TolerancesFile, Zero, chosen_tolerances, compared
+from trainctl.cli.diff import (
+    Absolute,
+    AsJson,
+    Form,
+    Html,
+    InTime,
+    Junit,
+    Rows,
+    TolerancesFile,
+    Zero,
+    chosen_form,
+    chosen_tolerances,
+    compared,
+)
 
 Source = Annotated[Path, typer.Argument(help="Run folder, log of SUMO's or folder of these.")]
 Golden = Annotated[Path, typer.Argument(help="Folder of the golden.")]
@@ -37,15 +50,15 @@ def register(app: typer.Typer) -> None:
         tolerance: Absolute = None,
         time_tolerance: InTime = None,
         zero: Zero = False,
-        form: Form = "text",
+        form: Form = None,
         as_json: AsJson = False,
         rows: Rows = False,
         junit: Junit = None,
         html: Html = None,
     ) -> None:
         """Hold a run or logs against their golden: the same as `trainctl diff GOLDEN SOURCE`; exit 1 if they differ."""
-        chosen = chosen_tolerances(tolerances, 0.0 if zero else tolerance, time_tolerance)
-        compared(golden, source, chosen, "json" if as_json else form, rows, junit, html, False)
+        chosen = chosen_tolerances(tolerances, tolerance, time_tolerance, zero)
+        compared(golden, source, chosen, chosen_form(form, as_json, rows), rows, junit, html, False)
 
     @golden.command()
     def update(
@@ -57,5 +70,5 @@ def register(app: typer.Typer) -> None:
         zero: Zero = False,
     ) -> None:
         """Show what moves, and write the golden anew: the same as `trainctl diff GOLDEN SOURCE --accept`."""
-        chosen = chosen_tolerances(tolerances, 0.0 if zero else tolerance, time_tolerance)
+        chosen = chosen_tolerances(tolerances, tolerance, time_tolerance, zero)
         compared(golden, source, chosen, "text", False, None, None, True)

@@ -23,6 +23,7 @@ from trainctl.cli.console import (
     listing,
     named,
     networks,
+    number,
     say,
     show,
     show_json,
@@ -37,7 +38,13 @@ if TYPE_CHECKING:
 @app.command()
 def run(
     name: ScenarioName = DEFAULT_SCENARIO,
-    out: Annotated[Path | None, typer.Option(help="Run folder; default runs/NAME. A run of ours there is replaced.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Run folder; default runs/NAME, with --set runs/NAME+KEY=VALUE. A run there is replaced, unless more than a run"
+            " lies there: then it goes to NAME-2."
+        ),
+    ] = None,
     backend: Annotated[Literal["sumo", "numeric"], typer.Option(help="SUMO, or the same loop without a simulator.")] = "sumo",
     gui: Annotated[bool, typer.Option("--gui", help="Watch the run in sumo-gui: tracks, trains by role, links.")] = False,
     gui_program: Annotated[str, typer.Option(help="The program --gui starts; sumo is the same without a window.")] = "sumo-gui",
@@ -59,13 +66,16 @@ def run(
     Exit 1 if trains collided or waited for each other in a circle; with the supervisor on also if one was too fast for its line.
     """
     from trainctl import runner
+    from trainctl.record.folder import place_for, run_name
 
     if gui and backend == "numeric":
         raise InputError("--gui: shows SUMO; leave out --backend numeric")
     if record_every is not None:
         settings = [*(settings or []), f"run.record_every_s={record_every!r}"]
     model = named(name, settings)
-    folder = out if out is not None else Path("runs") / Path(name).stem
+    folder, elsewhere = (out, "") if out is not None else place_for(Path("runs") / run_name(name, settings or []))
+    if elsewhere:
+        say(elsewhere, error=True)
     shown = not (quiet or as_json)
     with Progress(f"{Path(name).stem}", shown and sys.stderr.isatty()) as advance:
         done = runner.run(model, folder, backend, force, sys.argv, advance, gui_program if gui else None, checkpoint_every)
@@ -101,11 +111,11 @@ def _summary(done: Run, model: Model) -> None:
         ("formation.final_error_m", "largest spacing error at the end", "m"),
     ):
         if isinstance(metrics.get(key), int | float):
-            fill(table, words, f"{metrics[key]:.6g} {unit}")
+            fill(table, words, f"{number(metrics[key])} {unit}")
     for line in summary(done):
         fill(table, line.title, f"FAILED: {line.text}" if line.failed else line.text)
-    fill(table, "results", f"{done.folder}/  (trainctl plot {done.folder}; trainctl metrics {done.folder})")
     show(table)
+    say(f"  results in {done.folder}/\n  trainctl plot {done.folder}\n  trainctl metrics {done.folder}\n")
     for note in model.roster.notes:
         say(f"warning: {note}")
 
@@ -161,6 +171,7 @@ def metrics(
     band_m: Annotated[float, typer.Option(help="Band for settling of spacings [m].")] = 1.0,
     section_m: Annotated[float | None, typer.Option(help="Kilometrage at which trains are counted [m].")] = None,
     everything: Annotated[bool, typer.Option("--all", help="Also the values of each train, link and unit.")] = False,
+    only: Annotated[str | None, typer.Option(help="Only metrics whose names begin like this: bounds, energy, traffic.gap.")] = None,
     names: Annotated[bool, typer.Option("--list", help="List all metrics with units and definitions.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -186,14 +197,24 @@ def metrics(
         from trainctl.metrics.traffic import metrics_of_fcd
 
         values = metrics_of_fcd(folder)
+    if only is not None:
+        kept = {key: value for key, value in values.items() if key.startswith(only)}
+        if not kept:
+            groups = dict.fromkeys(key.partition(".")[0] for key in values)
+            raise InputError(f"--only {only}: no metric begins like this; there are: {', '.join(groups)}")
+        values = kept
     if as_json:
         show_json(values)
         return
     table = listing(str(folder), "metric", "value", "unit")
+    group = ""
     for key, value in values.items():
         if everything or "/" not in key:
+            if group and group != key.partition(".")[0]:
+                table.add_section()
+            group = key.partition(".")[0]
             unit = measured.DEFINITIONS.get(key.partition("/")[0], ("", ""))[0]
-            fill(table, key, f"{value:.6g}" if isinstance(value, float) else str(value), unit)
+            fill(table, key, number(value), unit)
     show(table)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from trainctl.cli.console import fill, say
+from trainctl.cli.console import fill, number, say
 from trainctl.errors import InputError
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def compare(
         return
     table = listing(None, "metric", *(label.replace("_", " ") for label in labels), "unit")
     for row in rows:
-        fill(table, row["metric"], *(_shown(value) for value in row["values"]), row["unit"])
+        fill(table, row["metric"], *(number(value) for value in row["values"]), row["unit"])
     show(table)
     for name, reasons in left_out.items():
         for reason in reasons:
@@ -137,7 +137,7 @@ def _capacity(given: dict[str, Any], out: Path, formats: tuple[str, ...], worker
         km, kmh = plan.length_m / 1000.0, 3.6 * plan.speed_mps
         shown = listing(f"{plan.trains} trains over {km:g} km at {kmh:.3g} km/h at most", *capacity.COLUMNS)
         for row in table:
-            fill(shown, row["row"].replace("_", " "), *(_shown(row[key]) for key in list(capacity.COLUMNS.values())[1:]))
+            fill(shown, row["row"].replace("_", " "), *(number(row[key]) for key in list(capacity.COLUMNS.values())[1:]))
         show(shown)
         for path in pictures:
             say(path)
@@ -182,12 +182,6 @@ def _under_all(
     return runs, labels, left_out
 
 
-def _shown(value: Any) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
-
-
 def claims(
     paper: Annotated[str | None, typer.Option(help="Only this paper (see the first column).")] = None,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown.")] = False,
@@ -221,7 +215,7 @@ def claims(
                 table.add_column(column, ratio=share, overflow="fold")
             for claim in found:
                 if claim.paper == name:
-                    cells = [Text(_shown(value)) for value in claim[1:]]
+                    cells = [Text(number(value)) for value in claim[1:]]
                     cells[4].stylize(colours[claim.verdict])
                     fill(table, *cells)
             show(table)

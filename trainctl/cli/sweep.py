@@ -50,7 +50,7 @@ def register(app: typer.Typer) -> None:
         """Run a scenario with many settings and seeds, on all cores or a cluster, into one Parquet dataset.
 
         OUT gets results.parquet (one row per run: parameters, status, violations, metrics), summary.png and sweep.json. Exit 3
-        if runs failed; the others are there all the same. A collision is a result of its run, not a failed run.
+        if runs failed or were refused; the others are there all the same. A collision is a result of its run, not a failed run.
         """
         from trainctl.cli.console import show_json
         from trainctl.studies import sweep as sweeping
@@ -68,7 +68,7 @@ def register(app: typer.Typer) -> None:
             show_json({"folder": str(folder), **info})
         elif not quiet:
             _summary(folder, info)
-        if info["failed"]:
+        if info["failed"] or info["refused"]:
             raise typer.Exit(3)
         if strict and info["violated"]["runs"]:
             raise typer.Exit(1)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from trainctl.diff.closer import PLACES, Course, Kept, Shift, alike, shifted, stood, way
-from trainctl.diff.findings import UNITS, Difference, Finding, named, scaled, seconds, since
+from trainctl.diff.findings import UNITS, Difference, Finding, counted, named, scaled, seconds, short, since
 from trainctl.diff.rows import Place, TableDiff
 from trainctl.diff.tolerance import Tolerance, Tolerances
 from trainctl.signals import Bools, Floats
@@ -133,7 +133,7 @@ def _causes(t: TableDiff, tolerances: Tolerances) -> list[Finding]:
     out += _rows(todo)
     for name in sorted(t.tallies):
         out += _of_column(todo, name)
-    out += [Finding("column", f"column {name} is missing", [], [t.table], [name]) for name in t.lost_columns]
+    out += [Finding("column", f"column {short(name)} is missing", [], [t.table], [name]) for name in t.lost_columns]
     return out
 
 
@@ -151,20 +151,21 @@ def _constant(todo: _Open, name: str, most: bool = True) -> Finding | None:
     if not tally.numbers or not len(trains):
         return None
     f = {key: values[trains] for key, values in tally.figures.items()}
-    enough = f["count"] >= (BELIEVED if len(trains) < BELIEVED else 1)
     low, high = f["shift_low"], f["shift_high"]
-    plus = _agreed(low, high, enough & (low <= high) & (f["count"] == f["rows"]) & (np.sign(low) * np.sign(high) > 0))
+    plus = _agreed(low, high, (low <= high) & (f["count"] == f["rows"]) & (np.sign(low) * np.sign(high) > 0))
     low, high = f["scale_low"], f["scale_high"]
     with np.errstate(invalid="ignore"):
         narrow = np.isfinite(low) & np.isfinite(high) & (high - low < 1e-2 * np.abs(low + high)) & ~((low <= 1.0) & (high >= 1.0))
-        times = _agreed(low, high, enough & (low <= high) & (narrow | ~np.isfinite(low + high)))
+        times = _agreed(low, high, (low <= high) & (narrow | ~np.isfinite(low + high)))
     cause, agreed = ("shift", plus) if plus.sum() >= times.sum() else ("units", times)
     count = int(agreed.sum())
-    if not count or (most and count < len(trains) and (count < 2 or 2 * count <= len(trains))):
+    if f["count"][agreed].sum() < BELIEVED or (most and count < len(trains) and (count < 2 or 2 * count <= len(trains))):
         return None
     own = [int(k) for k in trains[agreed]]
     first = float(f["first_s"][agreed].min()) if t.time is not None else None
     every = count == len(np.intersect1d(t.all_a.trains(), t.all_b.trains()))
+    if most and name in PLACES and (count == 1 or not every):
+        return None  # of a train at a steady speed the place is shifted if it is late
     who = "" if every or not t.keys else f" of {named((t.trains[k] for k in own), _key(t))}"
     side = "shift" if cause == "shift" else "scale"
     low_, high_ = float(f[f"{side}_low"][agreed].max()), float(f[f"{side}_high"][agreed].min())
@@ -172,10 +173,10 @@ def _constant(todo: _Open, name: str, most: bool = True) -> Finding | None:
         return None
     if cause == "shift":
         by = _neat(low_, high_)
-        words = f"{name}{who} shifted by {by:+.6g}{since(first)}"
+        words = f"{short(name)}{who} shifted by {by:+.6g}{since(first)}"
     else:
         by = next((factor for factor in UNITS if low_ <= factor <= high_), _neat(low_, high_))
-        words = f"{name}{who} {scaled(by)}{since(first)}"
+        words = f"{short(name)}{who} {scaled(by)}{since(first)}"
     return todo.close(cause, words, own, {name}, False, from_s=first, by=by)
 
 
@@ -201,14 +202,14 @@ def _ends(todo: _Open) -> list[Finding]:
     if t.time is None or not len(t.all_a.trains()) or not len(t.all_b.trains()):
         return []
     for only, other, name, verb in (
-        (todo.only_a, t.all_b, "only_a", "ends before"), (todo.only_b, t.all_a, "only_b", "goes on after"),
+        (todo.only_a, t.all_b, "only_a", "ends earlier than"), (todo.only_b, t.all_a, "only_b", "ends later than"),
     ):  # fmt: skip
         presence = t.only_a if name == "only_a" else t.only_b
         end = float(other.figures["last_s"].max())
         late = [k for k in sorted(only) if presence.of("first_s", k) > end and not presence.of("doubled", k)]
         if late:
             last = max(presence.of("last_s", k) for k in late)
-            words = f"the log {verb} the reference does: at {seconds(end if name == 'only_a' else last)} instead of "
+            words = f"the log {verb} the reference: at {seconds(end if name == 'only_a' else last)} instead of "
             f = Finding(
                 "ends", words + seconds(last if name == "only_a" else end), [t.trains[k] for k in late], [t.table], from_s=end
             )
@@ -233,7 +234,7 @@ def _gone(todo: _Open, kept: Kept, told: dict[str, Tolerance]) -> list[Finding]:
             if all(alike(x.take(x.time >= begin - 1e-7), y.take(y.time >= begin - 1e-7), told, kept.decimals) for x, y in pairs):
                 whole = n == t.all_a.of("count", train)
                 first = None if whole else begin
-                words = f"{named([t.trains[train]], _key(t))} is called {t.trains[other]}{since(first)}"
+                words = f"{named([t.trains[train]], _key(t))} is called {short(t.trains[other])}{since(first)}"
                 out.append(todo.close("renamed", words, [train, other], set(), True, from_s=first))
                 break
     for only, all_there, elsewhere, cause in (
@@ -255,7 +256,7 @@ def _trips(todo: _Open, trains: list[int]) -> list[Finding]:
         routes = {name for name in own if name.startswith("route") and name.endswith("edges")}
         if routes:
             a, b = (str(text or "").split() for text in t.tallies[min(routes)].texts.get(train, ("", "")))
-            out.append(todo.close("route", f"{who} takes another way: {_instead(a, b)}", [train], routes, False))
+            out.append(todo.close("route", f"{who} takes another route: {_instead(a, b)}", [train], routes, False))
         times = own & TRIP_TIMES
         gaps = {name: _difference(t, name, train, "most").place for name in times if t.tallies[name].numbers}
         late = {name: (p.b - p.a) for name, p in gaps.items() if isinstance(p.a, float) and isinstance(p.b, float)}
@@ -271,7 +272,7 @@ def _trips(todo: _Open, trains: list[int]) -> list[Finding]:
 def _instead(a: list[str], b: list[str]) -> str:
     """Two ways in words: where they part."""
     k = next((k for k, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b)))
-    return f"{' '.join(b[k : k + 3]) or 'nothing'} instead of {' '.join(a[k : k + 3]) or 'nothing'}"
+    return f"{' '.join(map(short, b[k : k + 3])) or 'nothing'} instead of {' '.join(map(short, a[k : k + 3])) or 'nothing'}"
 
 
 def _ways(todo: _Open, kept: Kept, trains: list[int]) -> list[Finding]:
@@ -290,7 +291,7 @@ def _ways(todo: _Open, kept: Kept, trains: list[int]) -> list[Finding]:
             # where both have the same edges the other log may only have ended before
             if strange and (left or strange[0][1] <= a.time[-1]):
                 at = min(time for _, time in [*strange[:1], *left[:1]])
-                what = "another track" if tracks else "another way"
+                what = "another track" if tracks else "another route"
                 words = f"{who} takes {what}{since(at)}: {_instead([e for e, _ in x], [e for e, _ in y])}"
                 # what differs long before is no consequence
                 begins = {c: float(t.tallies[c].figures["first_s"][train]) for c in todo.columns[train]}
@@ -324,9 +325,9 @@ def _exchanged(todo: _Open, kept: Kept, trains: list[int], told: dict[str, Toler
                 continue
             a, b = (way(kept.a[train][0], kept.words) for train in (one, two))
             shared = [(max(time, dict(b)[edge]), edge) for edge, time in a if edge in dict(b)]
-            where = f" at {min(shared)[1]}" if shared else ""
-            names = t.trains[one], t.trains[two]
-            words = f"another order{where}: {names[1]} goes as {names[0]} did, and the other way round{since(at)}"
+            where = f" at {short(min(shared)[1])}" if shared else ""
+            names = short(t.trains[one]), short(t.trains[two])
+            words = f"another order{where}{since(at)}: {names[1]} runs as {names[0]} did, and {names[0]} as {names[1]}"
             out.append(todo.close("order", words, [one, two], None, True, from_s=at))
             begins[one] = begins[two] = math.inf
             break
@@ -352,8 +353,8 @@ def _orders(todo: _Open, kept: Kept, trains: list[int], shifts: dict[int, Shift]
                 continue
             done |= {one, two}
             first, second = (one, two) if switch[2] else (two, one)
-            a, b = t.trains[first], t.trains[second]
-            words = f"another order at {switch[0]}: {b}, {a} instead of {a}, {b}{since(switch[1])}"
+            a, b = short(t.trains[first]), short(t.trains[second])
+            words = f"another order at {short(switch[0])}{since(switch[1])}: {b}, {a} instead of {a}, {b}"
             if not (one in shifts and two in shifts):
                 words += "; what else differs of these two is counted with it"
             at = min(todo.first_s(one), todo.first_s(two))
@@ -397,17 +398,18 @@ def _late(todo: _Open, kept: Kept, shifts: dict[int, Shift]) -> list[Finding]:
         who, by, at = named([t.trains[train]], _key(t)), abs(found.by_s), found.from_s
         a, b = kept.pairs(train)[0]
         cause, words = ("late", f"{who} late by {seconds(by)}") if found.by_s > 0 else ("early", f"{who} early by {seconds(by)}")
+        why = ""
         if found.by_s < 0 and stood(a, at, at + by) and not stood(b, at, at + by):
             cause, words = "stop", f"{who} leaves out a stop of {seconds(by)}{_at(a, at, kept)}, and is early by that"
         elif found.by_s > 0 and stood(b, at, at + by) and not stood(a, at, at + by):
-            words += f", as it stands{_at(b, at, kept)}"
-        out.append(todo.close(cause, words + since(at), [train], found.columns, True, from_s=at, by=by))
+            why = f": it stands{_at(b, at, kept)}"
+        out.append(todo.close(cause, words + since(at) + why, [train], found.columns, True, from_s=at, by=by))
     return out
 
 
 def _at(course: Course, time: float, kept: Kept) -> str:
     before = [edge for edge, when in way(course, kept.words) if when <= time + 1.0]
-    return f" on {before[-1]}" if before else ""
+    return f" on {short(before[-1])}" if before else ""
 
 
 def _rows(todo: _Open) -> list[Finding]:
@@ -438,10 +440,11 @@ def _rows(todo: _Open) -> list[Finding]:
         last = max(presence.of("last_s", k) for k in trains)
         who = named((t.trains[k] for k in trains), _key(t))
         when = "" if t.time is None else f" at {seconds(first)}" if first == last else f" from {seconds(first)} to {seconds(last)}"
-        words = {
-            "doubled": f"{count} rows doubled", "dropped": f"{count} rows dropped",
-            "rows": f"{count} rows only in {side}",
-        }.get(kind, f"{kind} than in the reference: {count} rows")  # fmt: skip
+        rows = counted(count, "row")
+        verb = kind.replace("s ", " ") if len(trains) > 1 else kind
+        words = {"doubled": f"{rows} doubled", "dropped": f"{rows} dropped", "rows": f"{rows} only in {side}"}.get(
+            kind, f"{verb} than in the reference: {rows}"
+        )
         cause = kind if kind in ("doubled", "dropped", "rows") else "ends"
         of = f"{who} " if cause == "ends" else ""
         text = f"{of}{words}{f' of {who}' if who and not of else ''}{when}"
@@ -472,5 +475,5 @@ def _of_column(todo: _Open, name: str) -> list[Finding]:
         scatters = np.all(np.abs(figures["sum"]) <= 0.3 * figures["sum_abs"])  # of each train, to both sides
         if f.values >= 10 and scatters and most <= NOISE * size:
             f.cause, amount = "noise", f"scatters within {most:.3g}"
-    f.words = f"{name} {amount}{f' of {who}' if who else ''}{since(f.from_s)}"
+    f.words = f"{short(name)}{f' of {who}' if who else ''} {amount}{since(f.from_s)}"
     return [*out, f]

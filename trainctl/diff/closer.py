@@ -182,29 +182,33 @@ def shifted(
 
 def candidates(a: Course, b: Course, place: str, since: float, allowed: float) -> list[float]:
     """Shifts in time by which values of B stand in A, those that most values share first [s]."""
-    y, v = a.numbers[place], b.numbers[place]
+    known = np.isfinite(a.numbers[place])
+    a, v = a.take(known), b.numbers[place]
+    y = a.numbers[place]
     if len(a.time) < 3 or len(b.time) < 3:
         return []
-    moves = np.abs(np.gradient(v)) > 2 * allowed
+    moves = np.isfinite(v) & (np.abs(np.gradient(v)) > 2 * allowed)
     rows = np.flatnonzero(moves & (b.time >= since))
     if not len(rows):
         return []
-    step = float(np.median(np.diff(a.time)))
+    steps = np.diff(a.time)
+    if not (steps > 0).any():
+        return []
+    step = float(np.median(steps[steps > 0]))  # rows may stand twice
     votes: list[float] = []
     for row in rows[np.unique(np.linspace(0, len(rows) - 1, PROBES).astype(int))]:
         left, right = y[:-1] - v[row], y[1:] - v[row]
-        with np.errstate(invalid="ignore"):
-            crossed = np.flatnonzero((left * right <= 0) & (left != right))
+        crossed = np.flatnonzero((left * right <= 0) & (left != right))
         share = left[crossed] / (left[crossed] - right[crossed])
         votes += list(b.time[row] - (a.time[crossed] + share * (a.time[crossed + 1] - a.time[crossed])))
-    if not votes:
-        return []
+    seen = np.array(votes)
+    seen = seen[np.isfinite(seen)]  # a damaged log may hold any number
     eps = 0.1 * step
-    bins = np.round(np.array(votes) / eps).astype(int)
+    bins = np.round(seen / eps).astype(int)
     best: list[float] = []
     values, counts = np.unique(bins, return_counts=True)
     for value in values[np.lexsort((np.abs(values), -counts))][:TRIED]:
-        by = float(np.median(np.array(votes)[np.abs(bins - value) <= 1]))
+        by = float(np.median(seen[np.abs(bins - value) <= 1]))
         whole = round(by / step) * step
         by = whole if abs(by - whole) < 0.05 * step else float(round(by / step, 2) * step)
         if abs(by) > 1e-3 * step and all(abs(by - other) > 1e-9 for other in best):

@@ -14,6 +14,8 @@ from trainctl.signals import Ints
 
 #: Rows of one instant, or of a log without times, may not need more than this [bytes].
 INSTANT_BYTES = 1 << 27
+#: Times beyond this [s] are none.
+MAXIMUM_S = 1e12
 
 
 class Feed:
@@ -36,10 +38,12 @@ class Feed:
         if not batch.num_rows:
             return
         time = self._times(batch)
+        steps = time if self.last is None else np.append(self.last, time)
+        back = np.flatnonzero(np.diff(steps) < 0)
+        if len(back):
+            before, after = steps[back[0]] / 1e6, steps[back[0] + 1] / 1e6
+            raise InputError(f"{self.log.path}: time does not ascend: {after:.10g} s after {before:.10g} s")
         self.first, self.last = int(time[0]) if self.first is None else self.first, int(time[-1])
-        last = self.time[-1:] if len(self.time) else time[:1]
-        if np.any(np.diff(np.concatenate([last, time])) < 0):
-            raise InputError(f"{self.log.path}: time does not ascend near {time[0] / 1e6:g} s")
         rest = None if self.table is None or not self.table.num_rows else self.table
         try:
             self.table = batch if rest is None else pa.concat_tables([rest, batch], promote_options="permissive")
@@ -56,8 +60,12 @@ class Feed:
         if self.log.time not in batch.column_names:
             raise InputError(f"{self.log.path}: has rows without {self.log.time}")
         time = floats(batch[self.log.time])
-        if time is None or not np.all(np.abs(time) < 1e12):
-            raise InputError(f"{self.log.path}: a time is missing or not a finite number")
+        if time is None or not np.all(np.abs(time) < MAXIMUM_S):
+            one_by_one = ((value, floats(pa.chunked_array([[value]]))) for value in batch[self.log.time].to_pylist())
+            wrong = next(value for value, number in one_by_one if number is None or not abs(number[0]) < MAXIMUM_S)
+            raise InputError(
+                f"{self.log.path}: {self.log.time} = {'nothing' if wrong is None else wrong!s:.40}: must be a time in seconds"
+            )
         return np.round(time * 1e6).astype(np.int64)
 
     def take(self, limit: int | None) -> tuple[pa.Table, Ints]:

@@ -14,26 +14,27 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from trainctl.diff.rows import Place
+from trainctl.errors import printable
 
 #: What a finding can say.
 CAUSES = {
-    "units": "a column is the reference's times a constant",
-    "shift": "a column is the reference's plus a constant",
-    "missing": "a train of the reference is not there",
-    "added": "a train is there that the reference has not",
-    "renamed": "a train goes under another name",
-    "route": "a train takes another way",
+    "units": "a column equals the reference's times a constant",
+    "shift": "a column equals the reference's plus a constant",
+    "missing": "a train of the reference is missing",
+    "added": "a train is not in the reference",
+    "renamed": "a train has another name",
+    "route": "a train takes another route or another track",
     "order": "trains pass a switch in another order",
     "late": "a train does the same, later",
     "early": "a train does the same, earlier",
     "stop": "a stop is left out",
     "ends": "a log or a train begins or ends at another time",
-    "dropped": "single rows are not there",
-    "doubled": "rows stand twice",
-    "rows": "rows stand in one log only",
+    "dropped": "single rows are missing",
+    "doubled": "rows appear twice",
+    "rows": "rows appear in one log only",
     "column": "a column is missing",
     "noise": "values scatter about the reference",
-    "values": "values differ, by no rule that is known here",
+    "values": "values differ, in no pattern that is known here",
     "setting": "the scenarios or the ends of the runs differ",
     "file": "a log is missing",
 }
@@ -47,8 +48,8 @@ UNITS = {
     0.3048: "ft -> m", 3.280839895: "m -> ft",
 }  # fmt: skip
 
-#: Trains that are named in a finding's words.
-NAMED = 4
+#: Trains that are named in a finding's words, and letters of each name.
+NAMED, LETTERS = 4, 60
 
 
 @dataclass
@@ -91,23 +92,29 @@ class Finding:
     def where(self) -> str:
         """The tables and how much they hold of it, in words."""
         parts = [", ".join(self.tables)]
-        parts += [_number(self.values, "value")] * (self.values > 0) + [_number(self.rows, "row")] * (self.rows > 0)
+        parts += [counted(self.values, "value")] * (self.values > 0) + [counted(self.rows, "row")] * (self.rows > 0)
         return ": ".join(parts[:1]) + (f" ({', '.join(parts[1:])})" if parts[1:] else "")
 
 
 def named(trains: Iterable[str], key: str = "train") -> str:
     """Trains in words."""
-    every = list(trains)
-    if every == [""]:
+    if not key:  # the only row
         return ""
+    every = list(trains)
+    names = ", ".join(short(name) for name in every[:NAMED])
     if len(every) > NAMED:
-        return f"{len(every)} trains ({', '.join(every[:NAMED])}, ...)"
-    return (
-        f"{'train' if len(every) == 1 else 'trains'} {', '.join(every)}" if key in ("id", "train", "sender") else ", ".join(every)
-    )
+        return f"{len(every)} trains ({names}, ...)"
+    return f"{'train' if len(every) == 1 else 'trains'} {names}" if key in ("id", "train", "sender") else names
 
 
-def _number(count: int, what: str) -> str:
+def short(name: str) -> str:
+    """A name, or whatever stands in a log, as a part of a line."""
+    text = printable(name[: LETTERS + 1]) or '""'
+    return text if len(text) <= LETTERS else f"{text[: LETTERS - 3]}..."
+
+
+def counted(count: int, what: str) -> str:
+    """A number of things in words."""
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 

@@ -10,6 +10,8 @@ import json
 import os
 import re
 import shutil
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ import pyarrow.parquet as pq
 from trainctl.diff.columns import floats
 from trainctl.diff.sources import KINDS, sumo_log, sumo_logs_in
 from trainctl.errors import InputError
-from trainctl.record.folder import INFO, installed, ours, remove, write_info, write_json
+from trainctl.record.folder import INFO, beside, free, installed, ours, remove, write_info, write_json
 from trainctl.runs.run import Run
 from trainctl.runs.sumo_logs import kind_of
 
@@ -61,7 +63,7 @@ def make_golden(run: Run | Path | str, folder: Path | str, every_s: float = EVER
     run : Run or Path
         A complete run, or SUMO's logs.
     folder : Path
-        Where the golden is written; a run folder of ours or a golden there is replaced.
+        Where the golden is written; one that is there is replaced once the new one is whole.
     every_s : float
         Time between kept instants of trains, links and SUMO's fcd [s].
     units_every_s : float, optional
@@ -75,14 +77,23 @@ def make_golden(run: Run | Path | str, folder: Path | str, every_s: float = EVER
     place = Path(folder)
     if not (isinstance(every_s, int | float) and 0 < every_s < float("inf")):
         raise InputError(f"every_s = {every_s}: must be a number above 0")
+    if not (free(place) or golden_of_logs(place) or thinned(place)):
+        raise InputError(f"{place}: is no golden, and is not replaced by one")
     if not isinstance(run, Run) and not (Path(run) / INFO).exists():
-        return _of_logs(Path(run), place, float(every_s))
-    source = run if isinstance(run, Run) else Run(run)
+        logs = _logs(Path(run))
+        _beside(place, lambda fresh: _of_logs(logs, fresh, float(every_s)))
+    else:
+        source = run if isinstance(run, Run) else Run(run)
+        _beside(place, lambda fresh: _of_run(source, fresh, every_s, units_every_s or 5 * every_s))
+    return place
+
+
+def _of_run(source: Run, place: Path, every_s: float, units_every_s: float) -> None:
+    """The golden of a run."""
     if source.info.get("status") != "complete":
         raise InputError(f"{source.folder}: status {source.info.get('status')}: only a complete run can be a golden")
-    _free(place)
-    (place / "sumo").mkdir(parents=True)
-    steps = {"trains": every_s, "links": every_s, "units": units_every_s or 5 * every_s}
+    (place / "sumo").mkdir()
+    steps = {"trains": every_s, "links": every_s, "units": units_every_s}
     for table, every in steps.items():
         for path in source.files(table):
             _write(_kept(path, "time_s", every), place / f"{table}.parquet")
@@ -93,22 +104,12 @@ def make_golden(run: Run | Path | str, folder: Path | str, every_s: float = EVER
             _pack(path, place / "sumo" / f"{kind}.xml.gz")
     (place / "events.jsonl").write_bytes((source.folder / "events.jsonl").read_bytes())
     (place / "scenario.toml").write_bytes((source.folder / "scenario.toml").read_bytes())
-    clocks = ("command_line", "wall_time_s")
-    write_info(place, {k: v for k, v in source.info.items() if k not in clocks} | {THINNED: [*steps, "fcd"]})
-    return place
+    of_the_run = ("command_line", "wall_time_s", "files")
+    write_info(place, {k: v for k, v in source.info.items() if k not in of_the_run} | {THINNED: [*steps, "fcd"]})
 
 
-def _free(place: Path) -> None:
-    """Remove a golden or a run; refuse anything else."""
-    if not place.exists():
-        return
-    if not golden_of_logs(place):
-        Run(place)  # refuses what is not ours
-    remove(place)
-
-
-def _of_logs(source: Path, place: Path, every_s: float) -> Path:
-    """The golden of one of SUMO's logs, or of all in a folder."""
+def _logs(source: Path) -> dict[str, Path]:
+    """One of SUMO's logs, or all in a folder, by kind."""
     if source.is_dir():
         logs = sumo_logs_in(source)
     elif source.exists():
@@ -118,8 +119,11 @@ def _of_logs(source: Path, place: Path, every_s: float) -> Path:
         raise InputError(f"{source}: no such file or directory")
     if not logs:
         raise InputError(f"{source}: neither a run folder nor logs of SUMO: known are {', '.join(k.name for k in KINDS)}")
-    _free(place)
-    place.mkdir(parents=True)
+    return logs
+
+
+def _of_logs(logs: dict[str, Path], place: Path, every_s: float) -> None:
+    """The golden of SUMO's logs."""
     for kind, path in logs.items():
         if kind == "fcd":
             _write(_kept_of_log(path, every_s), place / "fcd.parquet")
@@ -129,7 +133,6 @@ def _of_logs(source: Path, place: Path, every_s: float) -> Path:
             _pack(path, place / f"{kind}.{kind_of(path)}.gz")
     about: dict[str, Any] = {"format": FORMAT, "schema_version": 1, "every_s": every_s, THINNED: ["fcd"]}
     write_json(place / GOLDEN, about | {"versions": {"trainctl": installed("trainctl")}})
-    return place
 
 
 def _pack(path: Path, target: Path) -> None:
@@ -193,13 +196,15 @@ def accept(baseline: Path | str, new: Path | str) -> None:
     Raises
     ------
     InputError
-        They are not of one form: a log in another format, a folder for a file.
+        They are not of one form: a log in another format, a folder for a file; or more than the old run would be lost.
     """
     old, source = Path(baseline), Path(new)
     if golden_of_logs(old) or thinned(old):
-        _beside(old, lambda place: make_golden(source, place, *_steps(old)))
+        make_golden(source, old, *_steps(old))
     elif ours(old) and ours(source):
-        _beside(old, lambda place: shutil.copytree(source, place))
+        if others := beside(old):
+            raise InputError(f"{old}: holds {', '.join(others)} beside its run: nothing was accepted")
+        _beside(old, lambda fresh: shutil.copytree(source, fresh, dirs_exist_ok=True))
     elif old.is_dir() and source.is_dir():
         there, here = sumo_logs_in(source), sumo_logs_in(old)
         for kind, path in there.items():
@@ -225,15 +230,20 @@ def _steps(golden: Path) -> tuple[float, float | None]:
     return step("trains") or EVERY_S, step("units")
 
 
-def _beside(place: Path, write: Any) -> None:
-    """Write a folder beside another, then put it in its place: never half of it."""
-    fresh, gone = place.with_name(f"{place.name}.new"), place.with_name(f"{place.name}.old")
-    remove(fresh)
-    write(fresh)
-    remove(gone)
-    place.rename(gone)
-    fresh.rename(place)
-    remove(gone)
+def _beside(place: Path, write: Callable[[Path], object]) -> None:
+    """Have a folder written beside another, then put it in its place: never half of it, and none lost if that fails."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    fresh = Path(tempfile.mkdtemp(prefix=f".{place.name}.", dir=place.parent))
+    try:
+        write(fresh)
+        fresh.chmod(place.parent.stat().st_mode & 0o777)
+        gone = fresh.with_name(f"{fresh.name}.old")
+        if place.exists():
+            place.rename(gone)
+        fresh.rename(place)
+        remove(gone)
+    finally:
+        remove(fresh)
 
 
 def _copied(source: Path, target: Path) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from trainctl.diff.columns import floats, resolution
-from trainctl.diff.findings import Finding
+from trainctl.diff.findings import Finding, counted, short
 from trainctl.diff.rows import TableDiff
 from trainctl.diff.runs import Report, at, told
 from trainctl.diff.tally import Evidence
@@ -60,10 +60,11 @@ def _page(report: Report) -> str:
         data.append(values)
     body = "".join(_finding(f, n, shown.get(id(f), [])) for n, f in enumerate(report.findings, 1))
     rows = sum(t.rows for t in report.tables)
+    names = escape(", ".join(t.table for t in report.tables))
     verdict = (
-        f'<p class="verdict held">No difference in {rows} rows of {escape(", ".join(t.table for t in report.tables))}.</p>'
+        f'<p class="verdict held">No difference in {counted(rows, "row")} of {names}.</p>'
         if report.same
-        else f'<p class="verdict broken">{len(report.findings)} findings in {rows} compared rows. '
+        else f'<p class="verdict broken">{counted(len(report.findings), "finding")} in {rows} compared rows. '
         f"First: {escape(report.first or '')}</p>"
     )
     notes = "".join(f"<li>{escape(note)}</li>" for note in report.notes)
@@ -144,7 +145,8 @@ def _curves(f: Finding, report: Report) -> list[Curves]:
                 or not t.tallies[d.column].numbers
             ):
                 continue
-            name = d.place.who.removeprefix(f"{t.keys[0]} ").split(",")[0] if t.keys else ""
+            name = d.place.who.removeprefix(f"{t.keys[0]} ") if t.keys else ""
+            name = name.partition(f", {t.keys[1]} ")[0] if len(t.keys) > 1 else name
             train = next((k for k in f.codes[t.table] if t.trains[k] == name), None)
             if train is None or (t.table, d.column, train) in done:
                 continue
@@ -161,12 +163,13 @@ def _of(t: TableDiff, column: str, train: int, report: Report) -> Curves | None:
         return None
     tolerance = report.tolerances.of(t.table, column)
     absolute = tolerance.absolute if tolerance.stated else max(tolerance.absolute, 1.01 * decimal, 1.01 * other)
-    span = float(np.nanmax(a) - np.nanmin(a)) if len(a) else 0.0
+    known = a[np.isfinite(a)]
+    span = float(np.ptp(known)) if len(known) else 0.0
     duration = float(np.ptp(time_a)) if len(time_a) else 0.0
     h = half_widths(absolute, tolerance.relative, tolerance.range, a, span)
     w = half_widths(tolerance.time_s, tolerance.time_relative, tolerance.time_range, time_a, duration)
     lower, upper = (a - h, a + h) if not tolerance.in_time else tube(time_a, a, w, h, time_a)
-    name = f"{t.table}.{column}{f', {t.keys[0]} {t.trains[train]}' if t.keys else ''}; tolerance {tolerance.told()}"
+    name = f"{t.table}.{column}{f', {t.keys[0]} {short(t.trains[train])}' if t.keys else ''}; tolerance {tolerance.told()}"
     return Curves(name, time_a, a, time_b, b, lower, upper, float(t.tallies[column].figures["first_s"][train]))
 
 

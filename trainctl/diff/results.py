@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from trainctl.diff.findings import Finding
+from trainctl.diff.findings import Finding, short
 from trainctl.diff.runs import Report, told
 from trainctl.errors import InputError
 
@@ -54,7 +54,7 @@ def _about(f: Finding) -> Iterable[str]:
     for label, d in (("first", f.first), ("largest", f.largest)):
         if d is not None:
             at = "" if d.place.time_s is None else f"{d.place.time_s:.10g} s, "
-            yield f"  {label}: {at}{d.place.who}: {d.column} {told(d.place)}"
+            yield f"  {label}: {at}{short(d.place.who)}: {short(d.column)} {told(d.place)}"
 
 
 def _clean(text: str) -> str:
@@ -62,14 +62,15 @@ def _clean(text: str) -> str:
 
 
 def github(report: Report) -> list[str]:
-    """The findings as GitHub's workflow commands: an error each, a notice if there are none."""
+    """The findings as GitHub's workflow commands: an error each, a notice if there are none, and one for each note."""
+    notes = [f"::notice title=trainctl diff%3A note::{_message(note)}" for note in report.notes]
     if report.same:
         rows = sum(t.rows for t in report.tables)
-        return [f"::notice title=trainctl diff::{_message(f'no difference in {rows} rows: {report.b} matches {report.a}')}"]
-    return [
+        return [*notes, f"::notice title=trainctl diff::{_message(f'no difference in {rows} rows: {report.b} matches {report.a}')}"]
+    return [*notes, *(
         f"::error file={_property(report.a)},title={_property(f'trainctl diff: {f.cause}')}::{_message(chr(10).join(_about(f)))}"
         for f in report.findings
-    ]
+    )]  # fmt: skip
 
 
 def _message(text: str) -> str:

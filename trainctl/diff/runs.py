@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from trainctl.diff.causes import causes
-from trainctl.diff.findings import Finding, merged
+from trainctl.diff.findings import Finding, merged, short
 from trainctl.diff.golden import golden_of_logs, thinned
 from trainctl.diff.rows import Place, TableDiff, compare
 from trainctl.diff.sources import KINDS, our_events, our_table, sumo_log, sumo_logs_in
 from trainctl.diff.tolerance import EXACT, Tolerance, Tolerances, parse_tolerances, read_tolerances
-from trainctl.errors import InputError
+from trainctl.errors import InputError, printable
 from trainctl.record.folder import INFO, plain
 from trainctl.runs.run import Run
 
@@ -50,9 +50,9 @@ class Report:
     @cached_property
     def findings(self) -> list[Finding]:
         """The differences by train and cause, in the order of time."""
-        out = [Finding("setting", f"{key}: {x} -> {y}") for key, x, y in self.settings]
+        out = [Finding("setting", printable(f"{key}: {x} -> {y}")) for key, x, y in self.settings]
         out += [Finding("file", f"log {text}", tables=[text.partition(":")[0]]) for text in self.files]
-        out += [Finding("renamed", f"train {old} is called {new}", [old, new]) for old, new in self.renamed.items()]
+        out += [Finding("renamed", f"train {short(old)} is called {short(new)}", [old, new]) for old, new in self.renamed.items()]
         return merged([*out, *(f for t in self.tables for f in causes(t, self.tolerances))])
 
     @property
@@ -62,9 +62,9 @@ class Report:
         if not found:
             return None
         table, time, who, column = min(found, key=lambda item: item[1])
-        where = ", ".join(part for part in ("" if time == math.inf else f"{time:.10g} s", who) if part)
+        where = ", ".join(part for part in ("" if time == math.inf else f"{time:.10g} s", who and short(who)) if part)
         text = f"{table}: {where}" if where else table
-        return text if column is None or column.first is None else f"{text}: {column.column} {told(column.first)}"
+        return text if column is None or column.first is None else f"{text}: {short(column.column)} {told(column.first)}"
 
     def as_dict(self) -> dict[str, Any]:
         """Everything in what JSON knows."""
@@ -91,23 +91,23 @@ class Report:
 
 def at(time_s: float | None, who: str) -> str:
     """Time and names in words."""
-    return ", ".join(part for part in ("" if time_s is None else f"{time_s:.10g} s", who) if part) or "the only row"
+    return ", ".join(part for part in ("" if time_s is None else f"{time_s:.10g} s", who and short(who)) if part) or "the only row"
 
 
 def told(place: Place) -> str:
     """A difference in words."""
-    text = f"{_short(place.a)} -> {_short(place.b)}"
+    text = f"{value_told(place.a)} -> {value_told(place.b)}"
     if place.difference is None:
         return text
-    tube = f"; tube {_short(place.lower)} .. {_short(place.upper)}" if place.lower is not None else ""
+    tube = f"; tube {value_told(place.lower)} .. {value_told(place.upper)}" if place.lower is not None else ""
     return f"{text} (by {place.difference:.3g}{tube})"
 
 
-def _short(value: float | str | None) -> str:
+def value_told(value: float | str | None) -> str:
+    """A value of a log in words."""
     if isinstance(value, float):
         return f"{value:.10g}"
-    text = "nothing" if value in (None, "") else str(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    return "nothing" if value in (None, "") else short(str(value))
 
 
 def _json(value: Any) -> Any:
@@ -264,7 +264,7 @@ def _scenarios(report: Report, a: Mapping[str, Any], b: Mapping[str, Any]) -> No
     for one, two, side in ((x, y, "A"), (y, x, "B")):
         for key in one:
             if key not in two:
-                _note(report, f"{key} = {_short(str(one[key]))}: only in {side}")
+                _note(report, f"{key} = {short(str(one[key]))}: only in {side}")
 
 
 def _flat(value: Any, key: str) -> dict[str, Any]:

@@ -279,7 +279,7 @@ def speed_over_position(drawn: Drawn) -> Figure:
     for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
         axes[0].plot(*style.envelope(position[rows], speed[rows]), label=label, **drawn.look[name])
     if drawn.known.reference is not None:
-        where, reference = leader_over(drawn.known.reference, drawn.instants)
+        where, reference, *_ = leader_over(drawn.known.reference, drawn.instants)
         axes[0].plot(where / 1000, reference, color="black", linestyle=":", label="reference", zorder=3)
     axes[0].set_xlabel("position [km]")
     axes[0].set_ylabel("speed [m/s]")

@@ -10,6 +10,7 @@ import fcntl
 import hashlib
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -24,6 +25,8 @@ SCHEMA_VERSION = 1
 #: What makes a run.json ours.
 FORMAT = "trainctl run"
 INFO = "run.json"
+#: Characters of a run's name; file systems take 255 bytes.
+NAME_AT_MOST = 120
 
 
 def partial_of(folder: Path) -> Path:
@@ -46,6 +49,51 @@ def free(folder: Path) -> bool:
     return folder.is_dir() and not folder.is_symlink() and all(path.name == f"{INFO}.new" for path in folder.iterdir())
 
 
+def written(folder: Path) -> list[str]:
+    """All files below a run folder, as paths within it."""
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir() or path.is_symlink())
+
+
+def beside(folder: Path) -> list[str]:
+    """What stands in the folder of a complete run that the run did not write: figures, pages, notes; files or whole folders."""
+    try:
+        info = json.loads((folder / INFO).read_text(encoding="utf-8"))
+        own = set(info["files"]) if info["status"] == "complete" else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+    if own is None:
+        return []
+    strange = [path for path in written(folder) if path not in own]
+    return list(dict.fromkeys(f"{path.partition('/')[0]}/" if "/" in path else path for path in strange))
+
+
+def run_name(scenario: str | Path, settings: Sequence[str] = ()) -> str:
+    """Name of a run by its scenario and the settings ``KEY=VALUE`` that were changed; long ones end in a digest.
+
+    Without commas: SUMO reads them as the ends of file names.
+    """
+    name = "+".join([Path(scenario).stem, *(re.sub(r"[^\w.=+\[\]-]+", "-", setting) for setting in settings)])
+    if len(name) <= NAME_AT_MOST:
+        return name
+    return f"{name[: NAME_AT_MOST - 9]}~{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+
+
+def place_for(folder: Path) -> tuple[Path, str]:
+    """Where a run goes that is to lie at ``folder`` if nothing of somebody else's is lost by it, and why elsewhere, in words.
+
+    The folder itself, else the first free one of ``DIR-2``, ``DIR-3``, ...
+    """
+    place, number, why = folder, 1, ""
+    while not free(place) and (not ours(place) or beside(place)):
+        if not why:
+            others = beside(place)
+            held_there = f"holds {', '.join(others[:4])}{' and more' if len(others) > 4 else ''} beside its run" if others else ""
+            why = f"{place}: {held_there or 'exists and is not a run of trainctl'}"
+        number += 1
+        place = folder.with_name(f"{folder.name}-{number}")
+    return place, f"{why}; this run goes to {place}" if why else ""
+
+
 @contextmanager
 def held(folder: Path) -> Iterator[None]:
     """Keep other processes from writing a run folder; the hold ends with the process, however that ends."""
@@ -58,7 +106,7 @@ def held(folder: Path) -> Iterator[None]:
         try:
             fcntl.flock(at, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise InputError(f"{folder}: another process is writing this run") from None
+            raise InputError(f"{folder}: another process is writing there") from None
         yield
     finally:
         os.close(at)
@@ -70,7 +118,7 @@ def open_partial(folder: Path | str, force: bool = False) -> Path:
     Parameters
     ----------
     folder : Path
-        ``DIR``. A run of ours there (or in ``DIR.partial``) is going to be replaced; anything else is refused.
+        ``DIR``. A run of ours there (or in ``DIR.partial``) is going to be replaced; anything else, or more, is refused.
     force : bool
         Replace anything, except a directory that holds the current one.
 
@@ -86,6 +134,10 @@ def open_partial(folder: Path | str, force: bool = False) -> Path:
             raise InputError(f"{place}: holds the current directory: choose another --out")
         if not (free(place) or ours(place) or force):
             raise InputError(f"{place}: exists and is not a run of trainctl: choose another --out, or --force to replace it")
+        if not force and (others := beside(place)):
+            raise InputError(
+                f"{place}: holds {', '.join(others)} beside its run: choose another --out, or --force to replace all of it"
+            )
     try:
         with held(partial):
             remove(partial)

@@ -6,7 +6,7 @@ streams it.
 The table a reader returns
 --------------------------
 ``Log.batches()`` yields pyarrow tables, in the order of the file, and begins anew at every call. However a log was written
-(XML, CSV with any separator and any style of header, Parquet; gzipped or not), the same run gives the same rows and columns:
+(XML, CSV with any separator and any style of header, gzipped or not; Parquet), the same run gives the same rows and columns:
 
 rows
     One per element that stands for something: a vehicle, person or container at an instant (``fcd``, ``emission``), a finished

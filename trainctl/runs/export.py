@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,9 @@ from trainctl.runs.run import Run
 
 TABLES = ("trains", "units", "links", "stops")
 
+#: How text begins that a spreadsheet would compute.
+FORMULA = r"^[=+\-@\t\r]"
+
 #: Rows read at once.
 ROWS = 1 << 16
 
@@ -30,7 +34,8 @@ MAT_BYTES = 2**31
 def to_csv(run: Run, folder: Path) -> list[Path]:
     """Write ``trains.csv``, ``units.csv``, ``links.csv`` and ``events.csv``, in pieces: memory does not grow with the run.
 
-    What is a list in an event is JSON in its field.
+    What is a list in an event is JSON in its field. A name that a spreadsheet would take for a formula (``=``, ``+``, ``-``, ``@``
+    first) has an apostrophe before it.
     Numbers are the shortest that give the same double again; what is not a number is an empty field.
 
     Parameters
@@ -68,9 +73,16 @@ def to_csv(run: Run, folder: Path) -> list[Path]:
             written.append(target)
     if not written:
         raise InputError(f"{run.folder}: no table recorded")
-    events = pd.DataFrame([{k: json.dumps(v) if isinstance(v, list | dict) else v for k, v in e.items()} for e in run.events])
+    events = pd.DataFrame([{k: _field(v) for k, v in e.items()} for e in run.events])
     events.to_csv(folder / "events.csv", index=False)
     return [*written, folder / "events.csv"]
+
+
+def _field(value: Any) -> Any:
+    """What stands in a field of events.csv."""
+    if isinstance(value, list | dict):
+        return json.dumps(value)
+    return f"'{value}" if isinstance(value, str) and re.match(FORMULA, value) else value
 
 
 def _batches(run: Run, table: str) -> Iterator[pa.RecordBatch]:
@@ -88,7 +100,9 @@ def _batches(run: Run, table: str) -> Iterator[pa.RecordBatch]:
 
 def _plain(column: Any) -> Any:
     if pa.types.is_dictionary(column.type):
-        return column.dictionary_decode()
+        column = column.dictionary_decode()
+    if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
+        return pc.if_else(pc.match_substring_regex(column, FORMULA), pc.binary_join_element_wise("'", column, ""), column)
     if pa.types.is_floating(column.type):
         return pc.if_else(pc.is_nan(column), pa.scalar(None, column.type), column)
     return column

@@ -25,11 +25,11 @@ def summary(run: Run) -> list[Line]:
 def bounds(info: Mapping[str, Any]) -> str:
     """Whether the bounds held."""
     if not info["violations"]:
-        return "none broken" if info.get("checks_failed") else "all held"
+        return "none violated" if info.get("checks_failed") else "all held"
     where = ""
     if first := info.get("first_violation"):
         where = f", first {first['bound']} of {first['who']} at {first['time_s']:g} s"
-    return f"{info['violations']} broken{where}: see kind = violation in events.jsonl"
+    return f"{info['violations']} violated{where}: see kind = violation in events.jsonl"
 
 
 def _happened(run: Run) -> Iterator[Line]:

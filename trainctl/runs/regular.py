@@ -9,9 +9,11 @@ parser would find is what the columns hold. Any doubt makes the block irregular,
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.csv as pc_csv
 
@@ -46,8 +48,8 @@ def regular_rows(block: bytes, kind: Kind, wanted: frozenset[str]) -> pa.Table |
     found = _lines(block, element) if block.endswith(b"</" + element + b">") and _plain(block) else None
     if found is None:
         return None
-    times, text, step = found
-    parts = _rows(text, len(step), kind)
+    times, lines, step = found
+    parts = _rows(block, lines, kind)
     if parts is None:
         return None
     tables, places = [], []
@@ -87,8 +89,27 @@ def in_order(parts: list[pa.Table], places: Sequence[Sequence[int] | Ints]) -> p
     return whole.take(pa.array(np.argsort(np.concatenate([np.asarray(p, np.int64) for p in places]))))
 
 
-def _lines(block: bytes, step: bytes) -> tuple[pa.Array, bytes, Ints] | None:
-    """Times of the steps, all rows (a line each), and the number of the step each row is in."""
+class _Lines(NamedTuple):
+    """Lines of a block: where each begins and ends, and the first letter of its element."""
+
+    begins: Ints
+    ends: Ints  # behind the line's end
+    letters: npt.NDArray[np.uint8]
+
+    def some(self, which: Ints | npt.NDArray[np.bool_]) -> _Lines:
+        return _Lines(self.begins[which], self.ends[which], self.letters[which])
+
+    def text(self, block: bytes) -> bytes:
+        """The lines one after the other."""
+        if not len(self.begins):
+            return b""
+        apart = np.flatnonzero(self.begins[1:] != self.ends[:-1])  # lines that follow each other are one piece
+        begins, ends = np.append(self.begins[0], self.begins[apart + 1]), np.append(self.ends[apart], self.ends[-1])
+        return b"".join([block[begin:end] for begin, end in zip(begins.tolist(), ends.tolist(), strict=True)])
+
+
+def _lines(block: bytes, step: bytes) -> tuple[pa.Array, _Lines, Ints] | None:
+    """Times of the steps, the lines of the rows, and the number of the step each row is in."""
     bytes_ = np.frombuffer(block, np.uint8)
     ends = np.append(np.flatnonzero(bytes_ == _NEWLINE), len(block))
     begins = np.append(0, ends[:-1] + 1)
@@ -104,24 +125,21 @@ def _lines(block: bytes, step: bytes) -> tuple[pa.Array, bytes, Ints] | None:
     letters = bytes_[marks + 1]
     opening, closing = letters == step[0], letters == _SLASH
     empty = opening & (bytes_[ends - 2 - (bytes_[ends - 1] == _RETURN)] == _SLASH)
-    row = ~(opening | closing)
+    lines, row = _Lines(begins, ends + 1, letters), ~(opening | closing)
     change = (opening & ~empty).astype(np.int64) - closing
     depth = np.cumsum(change) - change  # before each line
     if (depth[opening] != 0).any() or (depth[~opening] != 1).any() or not closing[-1]:
         return None
-    if _joined(block, begins[closing], ends[closing] + 1).replace(b"</" + step + b">", b"").strip():
+    if lines.some(closing).text(block).replace(b"</" + step + b">", b"").strip():
         return None
     times = np.empty(int(np.count_nonzero(opening)), object)
-    for lines, last in ((opening & ~empty, rb" *>"), (empty, rb" */>")):
-        told = _times(_joined(block, begins[lines], ends[lines] + 1), int(np.count_nonzero(lines)), step, last)
+    for which, last in ((opening & ~empty, rb" *>"), (empty, rb" */>")):
+        told = _times(lines.some(which).text(block), int(np.count_nonzero(which)), step, last)
         if told is None:
             return None
-        times[lines[opening]] = told
-    rows = np.flatnonzero(row)
-    firsts = np.flatnonzero(np.diff(rows, prepend=-2) > 1)  # of each run of rows
-    lasts = np.append(firsts[1:], len(rows))[: len(firsts)] - 1
+        times[which[opening]] = told
     column = pa.array([time.decode() or None for time in times.tolist()], pa.string())
-    return column, _joined(block, begins[rows[firsts]], ends[rows[lasts]] + 1), np.cumsum(opening)[rows] - 1
+    return column, lines.some(row), np.cumsum(opening)[row] - 1
 
 
 def _times(text: bytes, count: int, step: bytes, last: bytes) -> list[bytes] | None:
@@ -137,38 +155,34 @@ def _times(text: bytes, count: int, step: bytes, last: bytes) -> list[bytes] | N
     return pieces[1::2]
 
 
-def _joined(block: bytes, begins: Ints, ends: Ints) -> bytes:
-    return b"".join([block[begin:end] for begin, end in zip(begins.tolist(), ends.tolist(), strict=True)])
-
-
 #: Element, its rows among all, their values.
-_Part = tuple[str, Ints | slice, pa.Table]
+_Part = tuple[str, Ints, pa.Table]
 
 
-def _rows(text: bytes, count: int, kind: Kind) -> list[_Part] | None:
-    """So many rows, a line each, by element; None if those of one element with as many attributes are not alike."""
-    if not count:
-        return []
-    bytes_ = np.frombuffer(text, np.uint8)
-    letters = bytes_[np.flatnonzero(bytes_ == _LESS) + 1].astype(np.int64)
-    quotes = np.count_nonzero(bytes_ == _MARK)
-    if (letters == letters[0]).all() and quotes == count * text.count(b'"', 0, text.index(b"\n")):
-        whole = _rows_of(text, count, _tag(chr(letters[0]), kind))
-        return None if whole is None else [(_tag(chr(letters[0]), kind).decode(), slice(None), whole)]
-    ends = np.flatnonzero(bytes_ == _NEWLINE) + 1
-    begins = np.append(0, ends[:-1])
-    form = 256 * np.diff(np.searchsorted(np.flatnonzero(bytes_ == _MARK), ends), prepend=0) + letters
-    forms = np.unique(form)
-    if len(forms) > MOST_FORMS:
-        return None
+def _rows(block: bytes, lines: _Lines, kind: Kind) -> list[_Part] | None:
+    """Rows by element; None if those of one element with as many attributes are not alike."""
     out: list[_Part] = []
-    for one in forms.tolist():
-        which, tag = np.flatnonzero(form == one), _tag(chr(one % 256), kind)
-        part = _rows_of(_joined(text, begins[which], ends[which]), len(which), tag)
-        if part is None:
-            return None
-        out.append((tag.decode(), which, part))
+    for letter in np.unique(lines.letters).tolist():
+        tag = _tag(chr(letter), kind)
+        for which, text in _by_attributes(block, lines, np.flatnonzero(lines.letters == letter)):
+            part = _rows_of(text, len(which), tag)
+            if part is None or len(out) == MOST_FORMS:
+                return None
+            out.append((tag.decode(), which, part))
     return out
+
+
+def _by_attributes(block: bytes, lines: _Lines, which: Ints) -> Iterator[tuple[Ints, bytes]]:
+    """Rows with as many attributes, and their text."""
+    mine = lines.some(which)
+    text = mine.text(block)
+    marks = np.frombuffer(text, np.uint8) == _MARK
+    if np.count_nonzero(marks) == len(which) * text.count(b'"', 0, text.index(b"\n")):  # or one has less and one more
+        yield which, text
+        return
+    number = np.diff(np.searchsorted(np.flatnonzero(marks), np.cumsum(mine.ends - mine.begins)), prepend=0)
+    for one in np.unique(number).tolist():
+        yield which[number == one], mine.some(number == one).text(block)
 
 
 def _tag(letter: str, kind: Kind) -> bytes:

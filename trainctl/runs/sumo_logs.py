@@ -33,6 +33,9 @@ def kind_of(path: Path) -> str:
     with opened(path) as stream:
         head = stream.read(512)
     if head[:4] == b"PAR1":
+        with opened(path, unpack=False) as stream:
+            if stream.read(4) != b"PAR1":
+                raise InputError(f"{path}: a gzipped Parquet file: unpack it (Parquet is compressed itself)")
         return "parquet"
     return "xml" if decoded(head).lstrip()[:1] == "<" else "csv"
 
@@ -43,11 +46,13 @@ def decoded(head: bytes) -> str:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[BinaryIO]:
+def opened(path: Path, unpack: bool = True) -> Iterator[BinaryIO]:
     """The file, unpacked if it is gzipped; what goes wrong while it is read becomes one line."""
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: not a file (logs are read more than once: a pipe will not do)")
     try:
         with open(path, "rb") as raw:
-            packed = raw.read(2) == b"\x1f\x8b"
+            packed = unpack and raw.read(2) == b"\x1f\x8b"
             raw.seek(0)
             if packed:
                 with gzip.open(raw) as stream:

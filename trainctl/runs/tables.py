@@ -119,12 +119,14 @@ def parquet_rows(path: Path) -> Iterator[pa.Table]:
 
 
 def simple(column: pa.Array) -> pa.Array:
-    """Texts as strings, truth values as texts, numbers as they are."""
+    """Texts as strings, truth values as texts, numbers as they are, spans of time in seconds."""
     if pa.types.is_dictionary(column.type):
         column = column.dictionary_decode()
     kind = column.type
     if pa.types.is_floating(kind) or pa.types.is_integer(kind):
         return column
+    if pa.types.is_duration(kind):
+        return pc.divide(column.cast(pa.duration("us"), safe=False).cast(pa.int64()).cast(pa.float64()), 1e6)
     if pa.types.is_decimal(kind):
         return column.cast(pa.float64())
     return filled(column if pa.types.is_string(kind) else column.cast(pa.string()))

@@ -308,9 +308,21 @@ def sweep(
     InputError
         The plan or the folder cannot be used.
     """
+    from trainctl.record.folder import held
+
     todo = jobs(plan, Path(os.path.abspath(out)) / "runs" if keep else None)
     identity = _identity(plan, todo[0])
-    rows = _open_folder(out, identity, resume, force)
+    with held(out):
+        rows = _open_folder(out, identity, resume, force)
+    with held(out):
+        return _all(plan, out, todo, identity, rows, workers, scheduler, command_line, progress)
+
+
+def _all(
+    plan: SweepPlan, out: Path, todo: Sequence[Job], identity: Mapping[str, Any], rows: dict[str, dict[str, Any]],
+    workers: int | None, scheduler: str | None, command_line: Sequence[str], progress: Callable[[int, int, int], Any] | None,
+) -> dict[str, Any]:  # fmt: skip
+    """Run what of ``todo`` is not in ``rows`` yet."""
     known = {_key(job.parameters) for job in todo}
     rows = {key: row for key, row in rows.items() if key in known and row["status"] != "failed"}
     info = _about(identity, plan, todo, command_line)
@@ -321,13 +333,13 @@ def sweep(
         ordered = [{**rows[key], "run": job.number} for job in todo if (key := _key(job.parameters)) in rows]
         frame = write_results(ordered, out / RESULTS)
         counts = {name: sum(row["status"] == name for row in ordered) for name in ("complete", "failed", "refused")}
-        violated = sum(row["status"] == "complete" and row["violations"] > 0 for row in ordered)
+        number = sum(row["status"] == "complete" and row["violations"] > 0 for row in ordered)
         complete = counts["complete"]
         violated = {
-            "runs": violated,
+            "runs": number,
             "of": complete,
-            "share": violated / complete if complete else None,
-            "interval_95": wilson(violated, complete),
+            "share": number / complete if complete else None,
+            "interval_95": wilson(number, complete),
         }
         if complete:
             from trainctl.figures.sweep import summary
@@ -403,7 +415,8 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
             return
         with (
             LocalCluster(  # type: ignore[no-untyped-call]
-                n_workers=workers, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address=":0", silence_logs=50,
+                n_workers=workers, threads_per_worker=1, processes=True, memory_limit=0, silence_logs=50,
+                host="127.0.0.1", dashboard_address="127.0.0.1:0",  # nobody else's business
             ) as cluster,
             Client(cluster, set_as_default=False) as client,  # type: ignore[no-untyped-call]
         ):  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 import time
@@ -11,6 +12,9 @@ from pathlib import Path
 import pytest
 import tomli_w
 
+from trainctl.cli import console
+from trainctl.cli.console import number
+from trainctl.record.folder import run_name
 from trainctl.scenario.reading import read
 
 BIN = Path(sys.executable).parent / "trainctl"
@@ -25,8 +29,8 @@ def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("user")
     done = typed("run", "fully_distributed", "--backend", "numeric", "--set", "run.duration_s=50", "--strict", cwd=place)
     assert done.returncode == 0, done.stderr
-    assert "runs/fully_distributed" in done.stdout
-    return place / "runs" / "fully_distributed"
+    assert "runs/fully_distributed+run.duration_s=50" in done.stdout
+    return place / "runs" / "fully_distributed+run.duration_s=50"
 
 
 def test_help_imports_nothing_heavy():
@@ -50,7 +54,7 @@ def test_a_finished_run_can_be_replaced_and_leaves_nothing_partial(folder):
         ).returncode
         == 0
     )
-    assert [p.name for p in folder.parent.iterdir()] == ["fully_distributed"]
+    assert [p.name for p in folder.parent.iterdir()] == [folder.name]
     assert json.loads((folder / "run.json").read_text())["status"] == "complete"
 
 
@@ -127,3 +131,63 @@ def test_units_in_brackets_stand_in_the_help():
     assert "[ms]" in typed("replay", "--help").stdout
     module = subprocess.run([sys.executable, "-m", "trainctl", "replay", "--help"], capture_output=True, text=True, check=True)
     assert "[ms]" in module.stdout and "python -m trainctl replay" in module.stdout
+
+
+def test_nothing_of_the_users_is_replaced(tmp_path):
+    run = ("run", "fully_distributed", "--backend", "numeric", "--record-every", "10", "--json")
+    settings = ("--set", "run.duration_s=20")
+
+    def where(*more):
+        done = typed(*run, *settings, *more, cwd=tmp_path)
+        return (tmp_path / json.loads(done.stdout)["folder"] if done.returncode == 0 else None), done.stderr
+
+    first, said = where()
+    assert first == tmp_path / "runs" / "fully_distributed+run.duration_s=20+run.record_every_s=10.0" and not said
+    assert where() == (first, "")  # nothing else lies there, so it is replaced
+    (first / "notes.md").write_text("mine")
+    assert typed("plot", first, "--out", first / "figures", cwd=tmp_path).returncode == 0
+    second, said = where()
+    assert second == first.with_name(f"{first.name}-2")
+    assert "holds figures/, notes.md beside its run; this run goes to" in said
+    assert (first / "notes.md").read_text() == "mine" and not (second / "figures").exists()
+    assert where()[0] == second
+    stated, said = where("--out", first)
+    assert stated is None and "notes.md" in said and "--force" in said
+    assert where("--out", first, "--force")[0] == first and not (first / "notes.md").exists()
+
+
+def test_runs_are_named_by_their_settings():
+    assert run_name("a/my.toml") == "my"
+    assert run_name("my", ["controller.law=../x.py", "train.1=[1, 2]"]) == "my+controller.law=..-x.py+train.1=[1-2]"
+    assert "," not in run_name("my", ["a=1", "b=2,3"])  # SUMO would read two files
+    long = [run_name("my", [f"bounds.speed_upper_mps={k}" * 9]) for k in (1, 2)]
+    assert len(set(long)) == 2 and all(len(name) <= 120 for name in long)
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        (1234.5678, "1235"), (-1.4e-14, "0"), (0.00123456, "0.001235"), (123456.7, "123500"), (1e9, "1.000e+09"), (9.9996, "10"),
+        (2.5e-6, "2.500e-06"), (0.5, "0.5"), (3, "3"), (None, "-"), ("steps", "steps"), (math.inf, "inf"), (-0.25, "-0.25"),
+    ],
+)  # fmt: skip
+def test_numbers_are_short(value, shown):
+    assert number(value) == shown
+
+
+def test_metrics_come_in_groups_of_which_one_may_be_asked_for(folder):
+    asked = json.loads(typed("metrics", folder, "--only", "energy", "--json").stdout)
+    assert asked and all(key.startswith("energy.") for key in asked)
+    shown = typed("metrics", folder, "--only", "bounds").stdout
+    assert "bounds.broken" in shown and "energy" not in shown
+    wrong = typed("metrics", folder, "--only", "speed")
+    assert wrong.returncode == 2 and "there are: run, bounds," in wrong.stderr
+
+
+def test_scenarios_runs_and_keys_are_completed(folder, monkeypatch):
+    monkeypatch.chdir(folder.parents[1])
+    assert "robust_constrained" in console.scenario_names("ro") and "three_tracks" not in console.scenario_names("ro")
+    assert console.run_folders("runs/fu") == [str(folder.relative_to(folder.parents[1]))]
+    assert "topology.loss=" in console.settable("topology.l") and console.settable("x") == []
+    Path("my.toml").write_text("")
+    assert "my.toml" in console.scenario_names("m")

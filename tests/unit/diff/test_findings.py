@@ -156,10 +156,10 @@ def course(name, edges, speed=20.0, begin=0, n=200, length=1000.0):
     )
 
 
-def found(a, b, **more):
+def found(a, b, sort=("time", "id"), **more):
     from trainctl.diff.causes import causes
 
-    a, b = (pd.concat(parts).sort_values(["time", "id"], kind="stable") for parts in (a, b))
+    a, b = (pd.concat(parts).sort_values(list(sort), kind="stable") for parts in (a, b))
     return causes(compare(log(a, **more), log(b, **more), Tolerances(), {}), Tolerances())
 
 
@@ -169,7 +169,7 @@ def test_another_way_is_one_finding():
     b[0].loc[b[0].lane == "siding_0", "speed"] = 11.0
     (f,) = found(a, b)
     assert (f.cause, f.trains) == ("route", ["p"])
-    assert f.words == "train p takes another way from 50 s on: siding east instead of left east"
+    assert f.words == "train p takes another route from 50 s on: siding east instead of left east"
 
 
 def test_another_track_of_the_same_way():
@@ -193,8 +193,29 @@ def test_a_train_that_is_late_in_two_logs_is_one_finding():
     two = compare(log(trips, **how), log(slow, **how), Tolerances(), {})
     (f,) = merged([f for t in (one, two) for f in causes(t, Tolerances())])
     assert (f.cause, f.trains, f.by, f.tables) == ("late", ["p"], 7.0, ["fcd", "tripinfo"])
-    assert f.words == "train p late by 7 s, as it stands on b from 61 s on"
+    assert f.words == "train p late by 7 s from 61 s on: it stands on b"
     assert f.first.place.time_s == pytest.approx(60.0, abs=1.0)
+
+
+def test_one_value_is_no_shift():
+    how = {"name": "tripinfo", "time": None}
+    a = pd.DataFrame({"id": list("pqrs"), "depart": [0.0, 1.0, 2.0, 3.0], "routeLength": [100.0, 200.0, 300.0, 400.0]})
+    (f,) = found([a], [a.assign(routeLength=[101.0, 203.0, 307.0, 400.0])], sort=["id"], **how)
+    assert (f.cause, f.words) == ("values", "routeLength of trains p, q, r differs by up to 7")
+    (f,) = found([a], [a.assign(routeLength=[101.0, 201.0, 301.0, 400.0])], sort=["id"], **how)
+    assert (f.cause, f.by) == ("shift", 1.0)
+
+
+@pytest.mark.parametrize("others", [[], ["q"], ["q", "r"]])
+def test_a_train_at_a_steady_speed_is_late_and_its_place_is_not_shifted(others):
+    rest = [course(name, ["d", "e"], begin=7) for name in others]
+    a = course("p", ["a", "b", "c"])
+    b = a.copy()
+    b.loc[b.time >= 60, ["pos", "distance", "lane"]] = a.loc[a.time.between(57, 196), ["pos", "distance", "lane"]].to_numpy()
+    (f,) = found([a, *rest], [b, *rest])
+    assert (f.cause, f.words) == ("late", "train p late by 3 s from 60 s on")
+    (f,) = found([a, *rest], [a.assign(distance=a.distance + 4.0), *rest])
+    assert (f.cause, f.by) == ("shift", 4.0)
 
 
 def test_other_routes_of_several_trains():
@@ -204,7 +225,7 @@ def test_other_routes_of_several_trains():
     a = pd.DataFrame({"id": list("pqr"), "depart": [0.0, 1.0, 2.0], "route_edges": ["a b c", "a b d", "a b e"]})
     b = a.assign(route_edges=["a b c", "a x d", "a b f e"])
     told = [f.words for f in causes(compare(log(a, **how), log(b, **how), Tolerances(), {}), Tolerances())]
-    assert told == ["train q takes another way: x d instead of b d", "train r takes another way: f e instead of e"]
+    assert told == ["train q takes another route: x d instead of b d", "train r takes another route: f e instead of e"]
 
 
 def test_noise_is_called_noise():
@@ -212,7 +233,7 @@ def test_noise_is_called_noise():
     b = a.assign(distance=a.distance + np.random.default_rng(0).uniform(-0.05, 0.05, len(a)))
     (f,) = found([a], [b])
     assert f.cause == "noise"
-    assert f.words.startswith("distance scatters within 0.05 of train p")
+    assert f.words.startswith("distance of train p scatters within 0.05")
     (g,) = found([a], [a.assign(distance=a.distance * 1.001 + 1e-4 * a.time**2)])
     assert g.cause == "values"
 
@@ -221,7 +242,7 @@ def test_a_log_that_ends_before_is_one_finding():
     a = [course(name, ["a", "b"], begin=k) for k, name in enumerate("pqrs")]
     (f,) = found(a, [rows[rows.time < 150] for rows in a])
     assert (f.cause, f.rows, f.from_s) == ("ends", 4 * 50 + 6, 149.0)
-    assert f.words == "the log ends before the reference does: at 149 s instead of 202 s"
+    assert f.words == "the log ends earlier than the reference: at 149 s instead of 202 s"
 
 
 def test_a_train_that_is_missing_and_one_that_is_new():

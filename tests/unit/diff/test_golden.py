@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from trainctl.diff.golden import accept
 from trainctl.diff.rows import compare
 from trainctl.diff.runs import EXACT, Tolerances
 from trainctl.diff.sources import Log
@@ -47,6 +48,7 @@ def test_a_golden_has_no_clock_in_it(run, golden, tmp_path):
     again = make_golden(run.folder, tmp_path / "again", every_s=10.0)
     files = [p.relative_to(golden) for p in golden.rglob("*") if p.is_file()]
     assert files
+    assert "files" not in Run(golden).info
     assert all((golden / f).read_bytes() == (again / f).read_bytes() for f in files)
 
 
@@ -73,10 +75,38 @@ def test_only_a_complete_run_becomes_a_golden(run, tmp_path):
         make_golden(copy, tmp_path / "golden")
 
 
-def test_a_golden_replaces_runs_only(run, tmp_path):
+def test_a_golden_replaces_goldens_only(run, golden, tmp_path):
     (tmp_path / "thesis").mkdir()
-    with pytest.raises(InputError, match="not a run folder"):
-        make_golden(run, tmp_path / "thesis")
+    make_golden(run, tmp_path / "thesis")  # empty: nothing is lost
+    (tmp_path / "text").mkdir()
+    (tmp_path / "text" / "mine").touch()
+    with pytest.raises(InputError, match="text: is no golden"):
+        make_golden(run, tmp_path / "text")
+    whole = Path(shutil.copytree(run.folder, tmp_path / "whole"))
+    with pytest.raises(InputError, match="whole: is no golden"):
+        make_golden(golden, whole)  # exchanged: the run would be lost
+    assert assert_run_matches(whole, run.folder, EXACT).same
+
+
+def test_a_run_is_accepted_unless_notes_would_be_lost(run, tmp_path):
+    old, new = (Path(shutil.copytree(run.folder, tmp_path / name)) for name in "ab")
+    (old / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"holds notes\.txt beside its run: nothing was accepted"):
+        accept(old, new)
+    assert (old / "notes.txt").exists()
+    (old / "notes.txt").unlink()
+    (new / "events.jsonl").write_text("")
+    accept(old, new)
+    assert (old / "events.jsonl").read_text() == ""
+
+
+def test_a_golden_that_fails_leaves_the_old_one(golden, tmp_path):
+    before = sorted(tmp_path.rglob("*"))
+    (tmp_path / "cut.xml").write_text('<fcd-export><timestep time="0"><vehicle id="a" speed="1"/>')
+    for place in (golden, tmp_path / "new"):
+        with pytest.raises(InputError, match="not well-formed"):
+            make_golden(tmp_path / "cut.xml", place)
+    assert sorted(tmp_path.rglob("*")) == sorted([*before, tmp_path / "cut.xml"])
 
 
 def test_streams_are_read_in_step(monkeypatch):

@@ -13,6 +13,7 @@ import mutations
 import numpy as np
 import pytest
 
+import trainctl.diff
 import trainctl.testing
 from trainctl.diff.golden import accept, make_golden
 from trainctl.diff.page import page
@@ -104,6 +105,8 @@ def test_annotations(report, pair):
     assert any("train fast.1 late by 7 s" in line for line in lines)
     (clean,) = github(diff(pair[0], pair[0]))
     assert clean.startswith("::notice title=trainctl diff::no difference in 5139 rows")
+    noted = github(diff(pair[0], pair[0], parse_tolerances({"columns": {"sped": 1.0}})))
+    assert noted[0] == "::notice title=trainctl diff%3A note::tolerance of sped: no such column was compared"
 
 
 def test_json_has_the_findings(report):
@@ -175,11 +178,32 @@ def test_rows_behind_a_finding(pair, monkeypatch, capsys):
     assert re.search(r"fcd: \d+ s, id fast\.1: x [\d.]+ -> [\d.]+", out)
 
 
+def test_options_that_exclude_each_other_are_refused(typed, pair):
+    for options in (("--zero", "--tolerance", "1"), ("--json", "--format", "github"), ("--rows", "--format", "github")):
+        code, told = typed("diff", *pair, *options)
+        assert (code, len(told)) == (2, 1)
+        assert "give one of them" in told[0]
+
+
+def test_rows_behind_a_finding_in_json(pair, monkeypatch, capsys):
+    from trainctl.cli import program as cli
+
+    found = {}
+    for options in ((), ("--rows",)):
+        monkeypatch.setattr("sys.argv", ["trainctl", "diff", *map(str, pair), "--json", *options])
+        with pytest.raises(SystemExit):
+            cli.main()
+        found[options] = json.loads(capsys.readouterr().out)["findings"]
+    assert not any("behind" in f for f in found[()])
+    missing = {"table": "fcd", "time_s": 141.0, "who": "id fast.2", "column": "", "a": "row", "b": None}
+    assert missing in [row for f in found["--rows",] for row in f["behind"]]
+
+
 def test_options_say_instead_of_the_file(tmp_path):
     from trainctl.cli.diff import chosen_tolerances
 
     (tmp_path / "t.toml").write_text("relative = 0.1\n[columns]\nspeed = 0.5\npos = {absolute = 1.0, time_s = 9.0}\n")
-    told = chosen_tolerances(tmp_path / "t.toml", 0.25, 2.0)
+    told = chosen_tolerances(tmp_path / "t.toml", 0.25, 2.0, False)
     assert (told.of("fcd", "x").absolute, told.of("fcd", "x").relative, told.of("fcd", "x").time_s) == (0.25, 0.0, 2.0)
     assert (told.of("fcd", "speed").absolute, told.of("fcd", "speed").time_s) == (0.5, 2.0)
     assert (told.of("fcd", "pos").absolute, told.of("fcd", "pos").time_s) == (1.0, 9.0)
@@ -195,6 +219,23 @@ def test_a_tolerance_in_time_lets_a_late_train_pass(typed, finished, tmp_path):
     assert typed("diff", a, b)[0] == 1
     assert typed("diff", a, b, "--time-tolerance", "1")[0] == 1
     assert typed("diff", a, b, "--time-tolerance", "2")[0] == 0
+
+
+def test_the_example_of_the_page_is_what_is_printed(finished, tmp_path, monkeypatch, capsys):
+    from trainctl.cli import program as cli
+
+    frame = mutations.read(finished("merging").folder)
+    rows = frame[frame.id == "fast.1"]
+    late = mutations.later(rows, rows.time.iloc[100], 20.0, True)
+    other = mutations.ordered([frame[~frame.id.isin(["fast.1", "fast.2"])], late], frame.time.max())
+    a, b = mutations.write(frame, tmp_path / "a.xml"), mutations.write(other, tmp_path / "b.xml")
+    (tmp_path / "t.toml").write_text("absolute = 1.0\ntime_s = 5.0\n")
+    monkeypatch.setattr("sys.argv", ["trainctl", "diff", str(a), str(b), "--tolerances", str(tmp_path / "t.toml")])
+    with pytest.raises(SystemExit):
+        cli.main()
+    page = (Path(trainctl.diff.__file__).parent / "README.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```text\n(.*?)```", page, re.S)
+    assert capsys.readouterr().out == example
 
 
 # Accepting and goldens
@@ -258,7 +299,7 @@ def test_a_golden_of_a_run_is_accepted_as_it_was_thinned(finished, tmp_path):
 def test_what_is_no_golden_is_not_replaced(pair, tmp_path):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "text").write_text("mine")
-    with pytest.raises(InputError, match="not a run folder"):
+    with pytest.raises(InputError, match="thesis: is no golden"):
         make_golden(pair[0], tmp_path / "thesis")
     with pytest.raises(InputError, match="neither a run folder nor logs"):
         make_golden(tmp_path / "thesis", tmp_path / "golden")

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import re
 import shutil
 
 import numpy as np
 import pandas as pd
 import pytest
+import tomli_w
 from scipy.io import loadmat
 
+import trainctl
 from trainctl.errors import InputError
 from trainctl.runs import export
 from trainctl.runs.export import to_csv, to_mat
 from trainctl.runs.run import Run
+from trainctl.scenario.reading import read
 
 
 @pytest.fixture(scope="module")
@@ -83,3 +88,18 @@ def test_what_a_mat_file_cannot_hold_is_told(run, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="use csv"):
         to_mat(run, tmp_path / "run.mat")
     assert not list(tmp_path.iterdir())
+
+
+def test_names_are_no_formulas_for_a_spreadsheet(tmp_path):
+    """Ids come from other people's files; numbers stay numbers, negative ones too."""
+    scenario = read("fully_distributed", {"run.duration_s": 10.0})[0]
+    name = '=HYPERLINK("http://x")'
+    scenario["train"][0]["id"] = name
+    for link in scenario["link"]:
+        link["between"] = [name if train == 1 else train for train in link["between"]]
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(scenario))
+    done = trainctl.run(tmp_path / "s.toml", backend="numeric", out=tmp_path / "run")
+    files = to_csv(Run(done.folder), tmp_path / "csv")
+    cells = [cell for file in files for row in csv.reader(file.read_text().splitlines()) for cell in row]
+    assert f"'{name}" in cells and name not in cells
+    assert any(re.fullmatch(r"-[\d.e-]+", cell) for cell in cells)

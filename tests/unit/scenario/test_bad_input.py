@@ -224,3 +224,9 @@ def test_unknown_scenario_has_a_hint(typed):
     code, lines = typed("run", "fully_distributd")
     assert code == 2
     assert lines == ["fully_distributd: no such scenario (see `trainctl list`) and no such file; did you mean fully_distributed?"]
+
+
+def test_a_folder_whose_name_sumo_cannot_read_is_refused(typed, tmp_path):
+    code, lines = typed("run", "fully_distributed", "--out", "a,b")
+    assert code == 2 and len(lines) == 1 and "a comma for the end of a file's name" in lines[0]
+    assert not list(tmp_path.glob("a*"))

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from trainctl.errors import InputError, LawError
+from trainctl.record.folder import held
 from trainctl.studies import sweep as sweeping
 from trainctl.studies.results import shares, wilson
 from trainctl.studies.sweep import SweepPlan, half_width, job_model, jobs, seeds, sweep, values
@@ -193,3 +194,13 @@ def test_shares_are_told_per_combination(alone, tmp_path):
     sweep(plan, tmp_path / "a")
     rows = shares(tmp_path / "a", ["bounds.speed_upper_mps"])
     assert [(r["values"], r["runs"], r["of"]) for r in rows] == [((85.0,), 0, 2), ((85.5,), 0, 2)]
+
+
+def test_two_sweeps_do_not_write_into_one_folder(tmp_path):
+    plan = SweepPlan("fully_distributed", SHORT, [0], {}, "numeric")
+    out = tmp_path / "s"
+    out.mkdir()
+    for more in ({}, {"resume": True}, {"force": True}):
+        with held(out), pytest.raises(InputError, match="another process is writing there"):
+            sweep(plan, out, **more)
+    assert list(out.iterdir()) == []
