@@ -173,7 +173,8 @@ def request(
                 blocker = later if later >= 0 else waiting.blocker(i, rest)
             if blocker >= 0 and later < 0:
                 here = _standing(trains, there, granted, i, (), clearance, queues, joins)
-                if not _stood_on(here, zones.ends, i, [k, *rest]):
+                stuck_itself = any(True for _ in deadlock.needs(here, blocker, trains.before(queues)))
+                if not (stuck_itself or _stood_on(here, zones.ends, i, [k, *rest])):
                     waiting.add(i, [k, *rest])
             if blocker < 0 and outside[i]:  # nobody comes in before one who waits for the same, whatever for
                 blocker = stuck.blocker(i, [k, *rest])
@@ -200,6 +201,10 @@ def request(
             granted[one] = True
             until[i] = max(until[i], begin[r])
             _lead(leading, zones, i, r)
+        # With it go the turns up to its end, at once: who is let in next comes after it.
+        turns = {(i, int(edge[r])): r for r in _joining(trains, i, k, int(zones.ends[rest[-1] if rest else k]))}
+        joins |= turns
+        said += _turns(trains, queues, joins, turns, outside)
     for i in np.flatnonzero(outside & (room > 0.0)).tolist():  # perhaps to stand before what it has not
         blocker = in_place.get(i, -1)
         if blocker < 0:
@@ -209,17 +214,16 @@ def request(
             room[i], zone[i], by[i] = 0.0, edge[row[i]], blocker
         there[i] |= blocker < 0
     for (i, e), k in stretches.items():
-        if granted[i, e]:  # with it go the turns within it
-            last = int(zones.ends[k])
-            until[i] = max(until[i], begin[last])
-            for r in range(max(k, int(zones.ways.first[i]) + 1), last + 1):
-                if joining[edge[r]] and begin[r] > s[i] - length[i]:
-                    joins.setdefault((i, int(edge[r])), r)
+        if granted[i, e]:
+            until[i] = max(until[i], begin[zones.ends[k]])
+            for r in _joining(trains, i, k, int(zones.ends[k])):
+                joins.setdefault((i, int(edge[r])), r)
     barred = outside & (room <= 0.0)
     queues = {e: [i for i in queue if not barred[i]] for e, queue in queues.items()}
     said += _turns(trains, queues, joins, _open(_inside(joins, barred), stretches, granted), outside)
     _keep_places(trains, queues, joins, outside, room, zone, by)
-    for i in np.flatnonzero(present).tolist():  # what it has not requested, since it is to stand before
+    after = zones.following[row]
+    for i in np.flatnonzero(present & (after >= 0) & (begin[after] - s < reach)).tolist():  # not requested: it stands before
         k = _limit(trains, granted, i)
         if k >= 0 and (i, int(edge[k])) not in granted and begin[k] - s[i] < min(reach[i], room[i]):
             room[i], zone[i], by[i] = max(begin[k] - s[i], 0.0), edge[k], -1
@@ -310,11 +314,18 @@ def _standing(
         for place, j in enumerate(queue)
         if j in limits and begin[joins[j, e]] > trains.s[j]
     ]
-    new = [r for k in rows for r in range(k, zones.ends[k] + 1) if zones.net.joins[edge[r]] and (i, int(edge[r])) not in joins]
+    new = [r for r in _joining(trains, i, rows[0], int(zones.ends[rows[-1]])) if (i, int(edge[r])) not in joins] if rows else []
     turns += [(i, r, [m for m in queues.get(int(edge[r]), ()) if m in limits]) for r in new]  # it would come last
     return deadlock.standing(
         zones.ways, zones.net, trains.row, trains.s, trains.length, clearance, limits, turns, trains.before(queues)
     )
+
+
+def _joining(trains: Trains, i: int, k: int, last: int) -> list[int]:
+    """Rows of joins from row k to ``last`` that the rear of ``i`` has not left."""
+    ways, joins = trains.zones.ways, trains.zones.net.joins
+    rear = trains.s[i] - trains.length[i]
+    return [r for r in range(max(k, int(ways.first[i]) + 1), last + 1) if joins[ways.edge[r]] and ways.begin[r] > rear]
 
 
 def _stood_on(here: deadlock.Standing, ends: Ints, i: int, rows: Iterable[int]) -> bool:
