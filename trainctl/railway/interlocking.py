@@ -67,6 +67,7 @@ def order(state: State) -> Order:
 def request(
     zones: Zones, state: State, row: Ints, s: Floats, length: Floats, present: Bools, reach: Floats,
     clearance: float = 0.0, entering: Bools | None = None, stop: Floats | None = None, stands: Bools | None = None,
+    ordered: Sequence[tuple[int, int, int]] = (),
 ) -> tuple[State, Held, list[Decision]]:  # fmt: skip
     """Requests of all trains at one instant.
 
@@ -88,6 +89,8 @@ def request(
         Where each train will stand next by its own plan [m], inf if nowhere: what lies well beyond it does not request.
     stands : ndarray, shape (n,), optional
         Trains that stand there and are not to go on yet.
+    ordered : sequence of tuple
+        Train, a row of its way, and the train that must have passed there first.
 
     Returns
     -------
@@ -122,6 +125,19 @@ def request(
     for i, k, is_join in zip(*(a.tolist() for a in at), strict=True):
         (joins if is_join else stretches).setdefault((i, int(edge[k])), k)
     trains = Trains(zones, row, s, length, *coming(zones, row, present))
+    shut: dict[int, tuple[int, int]] = {}  # first row that a train must leave to another one, and that
+    for i, k, first in ordered:
+        shut[i] = min((k, first), shut.get(i, (k, first)))
+    for i, (k, first) in list(shut.items()):  # those behind it on its track wait with it
+        for (j, e), m in joins.items():
+            if (
+                e == edge[k]
+                and j not in shut
+                and trains.track(j, m) == trains.track(i, k)
+                and trains.distance(j, m) > begin[k] - s[i]
+            ):
+                shut[j] = (m, first)
+    joins = {(i, e): k for (i, e), k in joins.items() if i not in shut or k < shut[i][0]}
 
     queues = {int(e): [i for i in queue if (i, int(e)) in joins] for e, queue in state["joins"].items()}
     leave = {(i, e): g for i, e, g in state["stretches"]}
@@ -130,7 +146,7 @@ def request(
     in_place = _in_place(trains, present, np.flatnonzero(outside).tolist(), clearance)
     granted |= {key: False for key in order if outside[key[0]]}  # it has its place in the queue only
     for i in np.flatnonzero(stands & present).tolist():
-        if _gives_back(trains, present, granted, i, clearance, queues, joins):
+        if _gives_back(trains, present, granted, i, clearance, queues, joins, ordered):
             until[i] = s[i]
             for passed, found in ((stretches, granted), (joins, joins)):
                 for key in [key for key, k in passed.items() if key[0] == i and k > row[i]]:
@@ -164,6 +180,8 @@ def request(
             blocker = int(by[i])
         elif i in in_place:
             blocker = in_place[i]
+        elif i in shut and shut[i][0] <= zones.ends[k]:
+            blocker = shut[i][1]
         elif blocker < 0:
             rest, in_front = _needed_too(trains, i, k, clearance, leading, granted, queues)
             later = held.blocker(i, rest)
@@ -172,14 +190,16 @@ def request(
             if blocker < 0:
                 blocker = later if later >= 0 else waiting.blocker(i, rest)
             if blocker >= 0 and later < 0:
-                here = _standing(trains, there, granted, i, (), clearance, queues, joins)
+                here = _standing(trains, there, granted, i, (), clearance, queues, joins, ordered)
                 stuck_itself = any(True for _ in deadlock.needs(here, blocker, trains.before(queues)))
                 if not (stuck_itself or _stood_on(here, zones.ends, i, [k, *rest])):
                     waiting.add(i, [k, *rest])
             if blocker < 0 and outside[i]:  # nobody comes in before one who waits for the same, whatever for
                 blocker = stuck.blocker(i, [k, *rest])
+            if blocker < 0 and i in shut and rest and shut[i][0] <= zones.ends[rest[-1]]:
+                blocker = shut[i][1]
             if blocker < 0:
-                here = _standing(trains, there, granted, i, [k, *rest], clearance, queues, joins)
+                here = _standing(trains, there, granted, i, [k, *rest], clearance, queues, joins, ordered)
                 blocker = deadlock.in_a_circle(here, i, trains.before(queues))
         if blocker >= 0:
             stuck.add(i, [k, *rest])
@@ -208,7 +228,7 @@ def request(
     for i in np.flatnonzero(outside & (room > 0.0)).tolist():  # perhaps to stand before what it has not
         blocker = in_place.get(i, -1)
         if blocker < 0:
-            here = _standing(trains, there, granted, i, (), clearance, queues, joins)
+            here = _standing(trains, there, granted, i, (), clearance, queues, joins, ordered)
             blocker = deadlock.in_a_circle(here, i, trains.before(queues))
         if blocker >= 0:
             room[i], zone[i], by[i] = 0.0, edge[row[i]], blocker
@@ -218,6 +238,9 @@ def request(
             until[i] = max(until[i], begin[zones.ends[k]])
             for r in _joining(trains, i, k, int(zones.ends[k])):
                 joins.setdefault((i, int(edge[r])), r)
+    for i, (k, first) in shut.items():
+        if begin[k] - s[i] < min(reach[i], room[i]) and (present[i] or outside[i]):
+            room[i], zone[i], by[i] = max(begin[k] - s[i], 0.0), edge[k], first
     barred = outside & (room <= 0.0)
     queues = {e: [i for i in queue if not barred[i]] for e, queue in queues.items()}
     said += _turns(trains, queues, joins, _open(_inside(joins, barred), stretches, granted), outside)
@@ -256,7 +279,7 @@ def _until(
 
 def _gives_back(
     trains: Trains, present: Bools, granted: dict[tuple[int, int], bool], i: int, clearance: float, queues: dict[int, list[int]],
-    joins: dict[tuple[int, int], int],
+    joins: dict[tuple[int, int], int], ordered: Sequence[tuple[int, int, int]],
 ) -> bool:  # fmt: skip
     """Whether all can still get out if ``i`` does without what lies ahead of it."""
     ways = trains.zones.ways
@@ -264,7 +287,7 @@ def _gives_back(
     without = {key: g and not (key[0] == i and key[1] in ahead) for key, g in granted.items()}
     if without == granted:
         return True
-    here = _standing(trains, present, without, i, (), clearance, queues, joins)
+    here = _standing(trains, present, without, i, (), clearance, queues, joins, ordered)
     return deadlock.in_a_circle(here, i, trains.before(queues)) < 0
 
 
@@ -302,7 +325,7 @@ def _limit(trains: Trains, granted: dict[tuple[int, int], bool], i: int, more: C
 
 def _standing(
     trains: Trains, on: Bools, granted: dict[tuple[int, int], bool], i: int, rows: Sequence[int], clearance: float,
-    queues: dict[int, list[int]], joins: dict[tuple[int, int], int],
+    queues: dict[int, list[int]], joins: dict[tuple[int, int], int], ordered: Sequence[tuple[int, int, int]],
 ) -> deadlock.Standing:  # fmt: skip
     """Where all may come to stand if ``i`` gets the stretches at these rows."""
     zones, begin, edge = trains.zones, trains.zones.ways.begin, trains.zones.ways.edge
@@ -316,6 +339,7 @@ def _standing(
     ]
     new = [r for r in _joining(trains, i, rows[0], int(zones.ends[rows[-1]])) if (i, int(edge[r])) not in joins] if rows else []
     turns += [(i, r, [m for m in queues.get(int(edge[r]), ()) if m in limits]) for r in new]  # it would come last
+    turns += [(j, k, [first]) for j, k, first in ordered if j in limits]
     return deadlock.standing(
         zones.ways, zones.net, trains.row, trains.s, trains.length, clearance, limits, turns, trains.before(queues)
     )

@@ -14,6 +14,7 @@ import numpy as np
 from sumo_net import Line, LineError, Rails
 from sumo_net.layout import Gradient
 from trainctl.errors import InputError
+from trainctl.scenario import passages
 from trainctl.scenario.tables import Scenario, TrafficTable, Train, TrainType
 from trainctl.scenario.train_types import train_type
 from trainctl.signals import Bools, Floats, Ints
@@ -170,6 +171,11 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
                 speed_mps=min(float(d.speed_mps if d.speed_mps is not None else scenario.reference.speed_mps or 0.0),
                               traffic.kinds[d.kind].max_speed_mps, share * float(rails.speed_mps[way[0]])),
             )
+        )  # fmt: skip
+    if not found:
+        found += passages.mistakes(
+            scenario.order, dict(zip(ids, routes, strict=True)),
+            {rails.edges[e]: rails.edges[f] for e, f in enumerate(rails.twin.tolist()) if f >= 0},
         )  # fmt: skip
     if found:
         raise InputError(list(dict.fromkeys(found)))

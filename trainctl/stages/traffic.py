@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -89,6 +90,11 @@ class Traffic:
             p.supervision.emergency_mps2, p.supervision.service_mps2, *([p.driving.deceleration_mps2] if p.driven else [])
         )
         self.requesting = np.minimum(p.assumed.braking, planned)  # what is requested for, and braked with at least
+        number = {name: i for i, name in enumerate(p.scenario.ids)}
+        # Pairs of trains that pass an edge one after the other: edge, who goes first, who comes next.
+        self.pairs = [
+            (p.rails.index[order.edge], number[a], number[b]) for order in p.scenario.order for a, b in pairwise(order.trains)
+        ]
         self.ways: Ways | None = None
 
     def initial(self) -> State:
@@ -346,6 +352,20 @@ class Traffic:
             places[i] = np.inf if stop is None or stop.passing else stop.place
         return places
 
+    def _ordered(self, t: float, ways: Ways, seen: Seen, s: State) -> list[tuple[int, int, int]]:
+        """Trains that must let another one pass an edge first: train, row of the edge in its way, the other one."""
+        found = []
+        for edge, first, then in self.pairs:
+            here = [edge] if self.net.twin[edge] < 0 else [edge, self.net.twin[edge]]
+            rows = [
+                ways.first[i] + np.flatnonzero(np.isin(ways.edge[ways.first[i] : ways.first[i + 1]], here)) for i in (first, then)
+            ]
+            if not all(map(len, rows)) or s.left[first] or (not s.came[first] and self._given_up(t)[first]):
+                continue
+            if not (s.came[first] and seen.row[first] >= rows[0][0]) and not (s.came[then] and seen.row[then] >= rows[1][0]):
+                found.append((then, int(rows[1][0]), first))
+        return found
+
     def _request(self, t: float, ways: Ways, seen: Seen, reach: Floats, entering: Bools, s: State) -> tuple[State, Held]:
         """Let every train request what lies within its reach; ``entering`` (n,) are those that ask to enter the net."""
         if self.ways is not ways:  # they changed
@@ -353,6 +373,7 @@ class Traffic:
         requests, held, said = interlocking.request(
             self.zones, s.requests, seen.row, seen.position, self.length, seen.present, reach,
             self.p.supervision.margin_m + DRIVER_MARGIN_M, entering, self._own_stops(s), s.standing,
+            self._ordered(t, ways, seen, s),
         )  # fmt: skip
         ids, edges = self.p.scenario.ids, self.p.rails.edges
         for one in said:
