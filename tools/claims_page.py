@@ -21,7 +21,7 @@ BEGIN, END = "<!-- claims -->", "<!-- end of claims -->"
 
 HEAD = f"""# The claims of the papers
 
-Every number, bound and "validates that" sentence of the four papers, measured by `trainctl claims` (half a minute on two cores;
+Every number, bound and "validates that" sentence of the four papers, measured by `trainctl claims` (some 15 s on two cores;
 `--paper NAME` for one of them, `--json` for machines). Nothing on this page is typed in: `tools/claims_page.py` writes it.
 
 | verdict | meaning |

@@ -115,6 +115,7 @@ def test_z_obeys_its_matrix():
     """z' = [[-1.1, 1, 0], [-1, -2.31, 1], [0, -1, -0.1]] z, for every carriage behind a head, to 1e-5."""
     _, _, estimates = small_steps(0.5, 3.0)
     A = np.array([[-1.1, 1.0, 0.0], [-1.0, -2.31, 1.0], [0.0, -1.0, -0.1]])
+    np.testing.assert_allclose(law.carriage_matrix(0.1, 0.1, 0.1), A, rtol=1e-12)
     np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(A))[[0, 2]], [-1.555 - 1.105j, -0.400], atol=6e-4)
 
     def z(e, j):

@@ -32,15 +32,23 @@ PAGES = (
     "scenarios/README.md",
     "sumo_net/README.md",
     "sumo_net/OSM.md",
+    "tools/README.md",
+    "trainctl/README.md",
+    "trainctl/GLOSSARY.md",
+    "trainctl/LIMITS.md",
+    "trainctl/PYTHON.md",
     "trainctl/claims/README.md",
     "trainctl/controllers/README.md",
     "trainctl/diff/README.md",
+    "trainctl/runs/README.md",
+    "trainctl/studies/README.md",
 )
 
 #: Line of a page -> (what is executed instead, why). None: not executed.
 REPLACED: dict[str, tuple[str | None, str]] = {
     "make run": ("trainctl run --set run.duration_s=24 --out runs/three_tracks", "2400 s take half a minute; making .venv needs a package index"),
     "make test": (None, "this is the test suite"),
+    "trainctl run three_tracks": ("trainctl run three_tracks --set run.duration_s=24 --out runs/three_tracks", "the same"),
     "trainctl plot runs/three_tracks": ("trainctl plot runs/three_tracks --out figures", "to see that it writes"),
     "trainctl run fully_distributed --backend numeric": (
         "trainctl run fully_distributed --backend numeric --set run.duration_s=50", "2000 s take too long"),

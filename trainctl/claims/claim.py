@@ -14,7 +14,7 @@ VERDICTS = {
     REPRODUCED: "comes out as stated, from what the paper prints; where it prints nothing, the note names what was chosen",
     WITH_CORRECTION: "comes out once a print error is corrected, or a statement read more narrowly, as the note says",
     NOT: "does not come out; the note names every reading and value that was tried",
-    BEYOND: "judges an assumption of ours, such as force limits, that the paper does not make: no verdict on the paper",
+    BEYOND: "judges what the paper does not say, or an assumption of ours, such as force limits: no verdict on the paper",
 }
 
 
@@ -42,7 +42,7 @@ def claim(
 ) -> Claim:
     """A claim with its verdict: it holds as printed, holds with the correction that ``note`` names, or does not.
 
-    With ``beyond`` what is measured rests on an assumption of ours, and nothing is said of the paper.
+    With ``beyond`` it is not the paper's, or rests on an assumption of ours, and nothing is said of the paper.
     """
     verdict = BEYOND if beyond else NOT if not holds else WITH_CORRECTION if corrected else REPRODUCED
     return Claim("", text, stated, measured, unit, verdict, note)

@@ -399,6 +399,12 @@ def _reference(scene: Scene) -> Iterator[str]:
             yield f"reference: its speed steps by {step:g} m/s at {t:g} s; this law follows only speeds without steps"
 
 
+def carriage_matrix(l1: float, l2: float, l3: float) -> Floats:
+    """Matrix (3, 3) of dz/dt, z = (z1, z2, z3), of a carriage behind the head: (29)-(31) in closed loop."""
+    kappa = l1 + 1.0
+    return np.array([[-kappa, 1.0, 0.0], [-1.0, -(l2 + 1.0 + kappa**2), 1.0], [0.0, -1.0, -l3]])
+
+
 def _start(params: Params, scene: Scene) -> Iterator[str]:
     """(39) for every train, then whether the integrator's step resolves the loop."""
     c, h = scene.consists, scene.sub_step
@@ -412,6 +418,15 @@ def _start(params: Params, scene: Scene) -> Iterator[str]:
             rates.append(float(known.ell1[i] ** 2 + slope * slope + known.ell4[i]))
     if rates and max(rates) * h > STABLE:
         yield f"run.sub_step_s = {h:g}: too large for this start, {max(rates):.3g} 1/s times the step must not exceed {STABLE:g}"
+    behind = np.delete(known.units[:, 2:], known.first[:-1], axis=0)
+    fastest = max(
+        (float(np.abs(np.linalg.eigvals(carriage_matrix(*gains))).max()) for gains in np.unique(behind, axis=0)), default=0.0
+    )
+    if fastest * h > STABLE:
+        yield (
+            f"run.sub_step_s = {h:g}: too large for controller.carriage_l1, l2 and l3, whose loop has {fastest:.3g} 1/s: this "
+            f"times the step must not exceed {STABLE:g} (step at most {STABLE / fastest:.3g} s)"
+        )
     limited = np.isfinite(np.minimum(np.minimum(c.traction, c.traction_power), np.minimum(c.braking, c.braking_power)))
     r = float(c.actuator_rate[limited].max()) if limited.any() else 0.0
     if r * h > STABLE:

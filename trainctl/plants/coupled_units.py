@@ -307,8 +307,7 @@ def relied_on(
     force = np.minimum(consists.braking, consists.braking_power / fastest)
     down, weight = np.repeat(fall, units), np.add.reduceat(consists.mass, leading)
     given = np.add.reduceat(share * np.minimum(force, inertia * braking + consists.mass * down), leading) - weight * fall
-    pull = (
-        np.add.reduceat(share * np.minimum(consists.traction, consists.traction_power / fastest), leading) / consists.train_mass()
-    )
+    strongest = np.minimum(consists.traction, consists.traction_power / fastest)  # may be infinite, and a share 0
+    pull = np.add.reduceat(np.multiply(share, strongest, out=np.zeros_like(share), where=share > 0.0), leading)
     zero = np.zeros(len(top))
-    return Reliance(given / total, pull, np.add.reduceat(bias, leading) / total, zero, zero, zero)
+    return Reliance(given / total, pull / consists.train_mass(), np.add.reduceat(bias, leading) / total, zero, zero, zero)

@@ -116,7 +116,8 @@ def model_of(
     reference = scenario.reference.leader(start)
     first = graph.links(plan, graph.order_on_tracks(own[consists.first[:-1], POSITION], track), track)
     model = Model(
-        scenario=limits.resolved(scenario, bounds), file=file, law=law, params=params, plant=plant, plant_params=plant_params,
+        scenario=limits.resolved(scenario, limits.stated(scenario, plant, plant_params), bounds), file=file,
+        law=law, params=params, plant=plant, plant_params=plant_params,
         observer=observer, observer_params=observer_params, consists=consists, own=own, bounds=bounds, reference=reference,
         plan=plan, first_links=first, line=None, spec=None, net=None, roster=None,
     )  # fmt: skip

@@ -18,6 +18,16 @@ def _tighter(key: str) -> Any:
     return np.maximum if "lower" in key else np.minimum
 
 
+def stated(scenario: Scenario, plant: Plant, params: Any) -> Bounds:
+    """What [bounds], [plant] where it clamps, and [[train]] say of every train; infinite where nobody does."""
+    rows = list(scenario.bounds_of_trains())
+    for k, key in enumerate(KEYS):
+        clamp = getattr(params, key) if key in plant.CLAMPS else None
+        if clamp is not None:
+            rows[k] = _tighter(key)(rows[k], clamp)
+    return Bounds(*rows)
+
+
 def of_trains(scenario: Scenario, plant: Plant, params: Any, consists: Consists) -> Bounds:
     """Bounds of every train; without any of the inputs they are what its units can always give within the speed band.
 
@@ -30,12 +40,7 @@ def of_trains(scenario: Scenario, plant: Plant, params: Any, consists: Consists)
     consists : Consists
         Units of all trains.
     """
-    rows = list(scenario.bounds_of_trains())
-    for k, key in enumerate(KEYS):
-        clamp = getattr(params, key) if key in plant.CLAMPS else None
-        if clamp is not None:
-            rows[k] = _tighter(key)(rows[k], clamp)
-    bounds = Bounds(*rows)
+    bounds = stated(scenario, plant, params)
     minimum, maximum = room(bounds, plant, consists)
     return bounds._replace(
         input_lower=np.where(np.isfinite(bounds.input_lower), bounds.input_lower, minimum),
@@ -77,24 +82,32 @@ def differing(scenario: Scenario, plant: Plant, params: Any) -> list[str]:
             if len(set(values.values())) > 1:
                 acts = float(_tighter(key).reduce(list(values.values())))
                 who = "train" if len(trains) == 1 else "trains"
-                stated = ", ".join(f"{v:g} in {place}" for place, v in values.items())
-                found.append(f"{key} of {who} {', '.join(trains)} = {acts:g}: the tighter acts of {stated}")
+                places = ", ".join(f"{v:g} in {place}" for place, v in values.items())
+                found.append(f"{key} of {who} {', '.join(trains)} = {acts:g}: the tighter acts of {places}")
     return found
 
 
-def resolved(scenario: Scenario, bounds: Bounds) -> Scenario:
-    """The scenario as it is logged: with the input bounds that follow from the units, and a law's file by its name alone."""
+def resolved(scenario: Scenario, said: Bounds, bounds: Bounds) -> Scenario:
+    """The scenario as it is logged: input bounds that nobody stated follow from the units, a law's file has its name alone.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        As written.
+    said, bounds : Bounds
+        What ``stated`` and ``of_trains`` give.
+    """
     law = scenario.controller.law
     if law.endswith(".py"):  # a copy of it stands beside the scenario
         scenario = scenario.model_copy(update={"controller": scenario.controller.model_copy(update={"law": Path(law).name})})
-    if not np.all(np.isfinite(bounds.input_lower) & np.isfinite(bounds.input_upper)):
-        return scenario
-    low, high = bounds.input_lower.tolist(), bounds.input_upper.tolist()
-    if len(set(low)) == len(set(high)) == 1:
-        table = scenario.bounds.model_copy(update={"input_lower_mps2": low[0], "input_upper_mps2": high[0]})
-        return scenario.model_copy(update={"bounds": table})
-    own = [
-        t.model_copy(update={"input_lower_mps2": a, "input_upper_mps2": b})
-        for t, a, b in zip(scenario.train, low, high, strict=True)
-    ]
-    return scenario.model_copy(update={"train": tuple(own)})
+    for key, known, values in zip(KEYS[2:], said[2:], bounds[2:], strict=True):
+        news = np.isfinite(values) & ~np.isfinite(known)
+        if news.all() and np.all(values == values[0]):
+            scenario = scenario.model_copy(update={"bounds": scenario.bounds.model_copy(update={key: float(values[0])})})
+        elif news.any():
+            own = [
+                train.model_copy(update={key: value}) if new else train
+                for train, new, value in zip(scenario.train, news, values.tolist(), strict=True)
+            ]
+            scenario = scenario.model_copy(update={"train": tuple(own)})
+    return scenario

@@ -158,8 +158,8 @@ def examine(data: dict[str, Any], resolved: bool = False) -> tuple[Scenario | No
         except ValidationError as error:
             found += [line for line in mistakes(error, rest) if not (rest is not data and line.endswith(": missing"))]
             places = [e["loc"] for e in error.errors() if e["type"] != "missing"]
-            if any(len(p) == 2 and p[0] in ("train", "link") for p in places):
-                break  # without one of its trains or links it is another scenario
+            if any(len(p) == 2 and p[0] in ("train", "link", "train_type") for p in places):
+                break  # without one of its trains, links or types it is another scenario
             # Lists keep their numbers, or go as a whole.
             rest = _without(rest, [p[:1] if len(p) == 2 and isinstance(p[1], int) else p for p in places])
             if isinstance(rest.get("run"), dict):
@@ -207,7 +207,7 @@ def _inside(value: Any, place: tuple[int | str, ...]) -> bool:
 def mistakes(error: ValidationError, data: dict[str, Any], under: str = "", model: Any = Scenario) -> list[str]:
     """One line per mistake pydantic found: ``key = value: rule``."""
     lines = []
-    for e in error.errors(include_url=False):
+    for e in _of_the_member(error.errors(include_url=False)):
         loc = list(e["loc"])
         key = _key(loc, data)
         key = f"{under}.{key}" if under and key else under or key
@@ -231,6 +231,21 @@ def mistakes(error: ValidationError, data: dict[str, Any], under: str = "", mode
 
 
 _UNION_MEMBERS = {"int", "str", "float", "constrained-int", "constrained-float"}
+
+
+def _of_the_member(errors: list[Any]) -> list[Any]:
+    """Without what pydantic says of the other member where a value may be a number or a list: of a list, that it is no number."""
+
+    def of_the_other(e: Any) -> bool:
+        member = str(e["loc"][-1]) if e["loc"] else ""
+        is_list = isinstance(e["input"], list)
+        return member in _UNION_MEMBERS if is_list else member.startswith("tuple[")
+
+    def told_better(e: Any) -> bool:
+        place = e["loc"][:-1]
+        return any(o is not e and o["loc"][: len(place)] == place and not of_the_other(o) for o in errors)
+
+    return [e for e in errors if not (of_the_other(e) and told_better(e))]
 
 
 def _key(loc: list[Any], data: Any) -> str:

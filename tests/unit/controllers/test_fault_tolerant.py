@@ -237,3 +237,13 @@ def test_step_too_large_for_an_active_limit_is_refused():
     assert "run.sub_step_s = 0.1" in line and "r h = 50 * 0.1 = 5" in line and "at most 0.05 s" in line
     assert law.violations(law.Params(), scene(sub_step=0.1)) == []
     assert "too large for this start" in law.violations(law.Params(), scene(sub_step=0.5))[0]
+
+
+@pytest.mark.parametrize(
+    ("keys", "rate"), [({"carriage_l3": 1000.0}, "1e+03"), ({"carriage_l1": (0.1, 30.0, 0.1, 0.1, 0.1, 0.1)}, "962")]
+)
+def test_step_too_large_for_the_gains_of_a_carriage_is_refused(keys, rate):
+    """They diverge at once; of the list, only the second carriage is too fast."""
+    assert law.violations(law.Params(**keys), scene(sub_step=1e-3)) == []
+    (line,) = law.violations(law.Params(**keys), scene(sub_step=0.01))
+    assert f"whose loop has {rate} 1/s" in line and "step at most 0.002" in line

@@ -175,6 +175,17 @@ def test_string_gain(tmp_path: Path) -> None:
     assert values["string.peak_gain"] == 5.0
 
 
+@pytest.mark.parametrize(
+    ("ahead", "told", "expected"), [(0.0, [], 74.0), (90.0, [], -16.0), (0.0, [-3.5], -3.5), (90.0, [-3.5], -16.0)]
+)
+def test_gap_is_negative_where_trains_overlap(ahead: float, told: list[float], expected: float, tmp_path: Path) -> None:
+    """In a row, and between two rows, where only the event knows."""
+    tables = three_trains()
+    tables["trains"]["gap_m"] = tables["trains"]["gap_m"] - ahead
+    events = [{"kind": "violation", "time_s": 1.5, "bound": "gap_m", "trains": ["1", "2"], "value": value} for value in told]
+    assert metrics(run_folder(tmp_path, tables, scenario(), events))["traffic.gap_min_m"] == expected
+
+
 def test_traffic(tmp_path: Path) -> None:
     """Fronts at 0 s: 300, 200, 100; nobody passes where another was, unless a section is named."""
     run = run_folder(tmp_path, three_trains(), scenario())

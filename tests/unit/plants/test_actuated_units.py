@@ -195,3 +195,11 @@ def test_plant_needs_actuators_and_noise_on_the_integrators_grid():
     found = plant.violations(plant.Params(noise_variance_m2_per_s6=0.5), scene, [fault()])
     assert len(found) == 3
     assert "has no actuator" in found[0] and "must be above 0 for train 1" in found[1] and "multiple" in found[2]
+
+
+def test_units_without_limits_may_fail_altogether():
+    """0 of an infinite force is none: train 1 still pulls with its others, train 2 has no other."""
+    failed = [fault(kind="effectiveness", amplitude_n_per_s=None, effectiveness=0.0, unit=u, train=t) for t, u in ((1, 2), (2, 1))]
+    found = plant.relied_on(plant.Params(), consists(), failed, ("1", "2"), 0.5, np.full(2, 30.0), np.zeros(2), 6.0)
+    assert found.pull.tolist() == [INF, 0.0]
+    assert 0.0 < found.braking[0] < 0.5 and found.braking[1] == 0.0

@@ -181,6 +181,24 @@ def test_each_mistake_is_told_in_words(case, typed, tmp_path):
     assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) == ["mistaken.toml"]
 
 
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ('extends = "fault_tolerant"\n[controller]\ncarriage_l1 = [0.1, 0.1]\n', "controller.carriage_l1 = [0.1, 0.1]: has 2 values, it takes"),
+        ('extends = "fault_tolerant"\n[controller]\ncarriage_l1 = [0.1, -0.1, 0.1]\n', "controller.carriage_l1[2] = -0.1: input should be greater than 0"),
+        ('extends = "fault_tolerant"\n[controller]\nhead_l4 = "x"\n', "controller.head_l4 = x: input should be a valid number"),
+        ('extends = "emu_finite_time"\n[train_type.emu]\nunit_mass_kg = [6e4, 8e4]\n', "train_type.emu: unit_mass_kg has 2 values: units = 4 of them"),
+        ('extends = "emu_finite_time"\n[train_type.emu]\nunit_mass_kg = [6e4, "x", 8e4, 8e4]\n', "train_type.emu.unit_mass_kg[2] = x: input should be"),
+    ],
+)  # fmt: skip
+def test_one_line_for_a_mistake_in_a_list(text, line, typed, tmp_path):
+    """Neither that a list is no number, nor that trains have no type because their type is wrong."""
+    (tmp_path / "mistaken.toml").write_text(text)
+    code, lines = typed("check", "mistaken.toml")
+    assert code == 2
+    assert len(lines) == 1 and line in lines[0], lines
+
+
 def test_all_mistakes_come_at_once(typed, tmp_path):
     text = PAPER + (
         '[run]\nduration_s = "long"\ndt = 3\n[bounds]\nspeed_upper_mps = "85"\n[[train]]\nid = 3\nposition_m = -5.0\n'
