@@ -28,7 +28,6 @@ TRIPINFO = {
     "routeLength": "traffic.sumo_route_length_mean_m",
     "waitingTime": "traffic.sumo_waiting_time_mean_s",
     "timeLoss": "traffic.sumo_time_loss_mean_s",
-    "departDelay": "traffic.sumo_depart_delay_mean_s",
 }
 
 DEFINITIONS: dict[str, tuple[str, str]] = {
@@ -51,7 +50,6 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
     TRIPINFO["routeLength"]: ("m", "Mean route length."),
     TRIPINFO["waitingTime"]: ("s", "Mean waiting time (speed below 0.1 m/s)."),
     TRIPINFO["timeLoss"]: ("s", "Mean delay against driving at the allowed speed."),
-    TRIPINFO["departDelay"]: ("s", "Mean delay of the departure."),
     "traffic.collisions": ("1", "Collisions that SUMO counted."),
     "traffic.teleports": ("1", "Vehicles that SUMO teleported."),
     "traffic.emergency_stops": ("1", "Emergency stops that SUMO counted."),
@@ -129,6 +127,8 @@ def of_sumo(folder: Path) -> Values:
     if trips:
         sums, count = dict.fromkeys(TRIPINFO, 0.0), 0
         for _, attributes in elements(trips, "tripinfos", {"tripinfo"}):
+            if _number(trips, attributes, "arrival") < 0.0:  # under way when the run ended
+                continue
             count += 1
             for attribute in sums:
                 sums[attribute] += _number(trips, attributes, attribute)
