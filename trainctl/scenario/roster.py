@@ -289,6 +289,8 @@ def _changes(scenario: Scenario, traffic: Configuration) -> tuple[str, ...]:
     found = [f"option step-length = {traffic.step_s:g}: run.step_s = {step:g} instead"] if traffic.step_s != step else []
     if block != "files":
         found.append(f"option railsignal-moving-block: controller.block = {block} instead")
+    if traffic.drawn:
+        found.append(f"flows {', '.join(traffic.drawn[:8])}: SUMO draws their trains itself, so none of them is planned for a time")
     return (*found, "options time-to-teleport and collision.action: trains are never teleported, none is removed that collides")
 
 

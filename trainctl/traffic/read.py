@@ -95,6 +95,7 @@ class Configuration(NamedTuple):
     notes: tuple[str, ...]  # what is not followed
     signs: tuple[Change, ...]  # variable speed signs
     closings: tuple[Closing, ...]
+    drawn: tuple[str, ...]  # flows whose departures are drawn
 
 
 def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, seed: int = 42) -> Configuration:
@@ -210,6 +211,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         notes=(*notes, *more_notes),
         signs=tuple(signs),
         closings=tuple(closed),
+        drawn=tuple(t.get("id", "") for t in trains if "probability" in t.attrib or t.get("period", "").startswith("exp")),
     )
 
 
