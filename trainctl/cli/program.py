@@ -224,6 +224,9 @@ def plot(
     out: Annotated[Path | None, typer.Option(help="Where the figures go; default FOLDER/figures.")] = None,
     formats: Annotated[list[str] | None, typer.Option("--format", help="png, svg, pdf; repeatable; default png.")] = None,
     width: Annotated[Literal["single", "double"], typer.Option(help="A column of print (85 mm) or a page (178 mm).")] = "double",
+    clock: Annotated[bool, typer.Option("--clock", help="Time in hours and minutes of the run.")] = False,
+    kmh: Annotated[bool, typer.Option("--kmh", help="Speeds in km/h.")] = False,
+    caption: Annotated[bool, typer.Option("--caption", help="Title, law, version and seed below every figure.")] = False,
 ) -> None:
     """Draw all figures that apply to a run."""
     from trainctl.figures.catalogue import plot as draw
@@ -233,7 +236,7 @@ def plot(
     wrong = [f for f in wanted if f not in ("png", "svg", "pdf")]
     if wrong:
         raise InputError([f"--format {f}: must be one of png, svg, pdf" for f in wrong])
-    for path in draw(Run(folder), out or folder / "figures", wanted, width):
+    for path in draw(Run(folder), out or folder / "figures", wanted, width, clock=clock, kmh=kmh, caption=caption):
         say(path)
 
 
