@@ -85,7 +85,9 @@ def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
             else:
                 at, red = done[axis].to_numpy(float), violated
                 places = np.unique(at)
-                middle = [np.nanmedian(value[at == x]) if np.isfinite(value[at == x]).any() else np.nan for x in places]
+                counted = np.where(never, np.inf, value)  # who did not settle is later than all who did
+                middle = [np.nanmedian(counted[at == x]) if (~np.isnan(counted[at == x])).any() else np.nan for x in places]
+                middle = [m if np.isfinite(m) else np.nan for m in middle]
                 panel.plot(places, middle, color=style.GREY, label="median")
             for chosen, colour, label in ((~red, 0, "all bounds held"), (red, 1, "a bound violated")):
                 if chosen.any():
