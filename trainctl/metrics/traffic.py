@@ -196,8 +196,10 @@ def _of_rows(batches: Iterable[pa.Table], path: Path, parked: Mapping[str, Seque
     spacing, headway = _Mean(), _Mean()
     for batch in batches:
         time, speed = batch["time"].to_numpy(), batch["speed"].to_numpy()
-        if np.any(np.diff(time) < 0) or time[0] <= end:
-            raise InputError(f"{path}: time does not ascend near {time[0]:g} s")
+        back = np.flatnonzero(np.diff(time) < 0)
+        if len(back) or time[0] <= end:
+            before, after = (time[back[0]], time[back[0] + 1]) if len(back) else (end, time[0])
+            raise InputError(f"{path}: time does not ascend: {after:.10g} s after {before:.10g} s")
         begin, end = min(begin, float(time[0])), float(time[-1])
         names.update(batch["id"].unique().to_pylist())
         steps += 1 + int(np.count_nonzero(np.diff(time) > INSTANT))
