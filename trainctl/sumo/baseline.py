@@ -17,7 +17,7 @@ from trainctl.railway.ways import rerouted, ways
 from trainctl.scenario.model import Model
 from trainctl.signals import Bools, Floats, Ints, Observed, Seen
 from trainctl.sumo.baseline_files import departures, verify_signals, write_configuration, write_own_configuration, write_routes
-from trainctl.sumo.session import TOLERANCE_M, Session
+from trainctl.sumo.session import LOGS, TOLERANCE_M, Session
 
 #: How far ahead SUMO is asked for the next train on a net [m].
 LOOK_M = 20_000.0
@@ -47,6 +47,8 @@ class Baseline(Session):
         verify_signals(p)
         self.p, self.ids = p, p.scenario.ids
         self.departures = departures(p) if p.placed else []
+        if any(p.roster.stops):
+            self.logs = LOGS | {"stop-output": "stops.xml"}
         self.number = {name: i for i, name in enumerate(self.ids)}
         self.length = p.consists.train_length()
         self.track = np.array([line.track_ids.index(t) for t in line.tracks], np.int64)
