@@ -41,7 +41,9 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
     "bounds.first_violation_s": ("s", "Time of the first recorded instant at which a bound is violated; absent if none is."),
     "bounds.first_violation_who": ("text", "Which bound of whom is violated at that instant."),
     "formation.settling_s": (
-        "s", "Time after which every link stays within the band (default 1 m) of its desired spacing; None: never."),
+        "s", "Time of the run from which every link that there is stays within the band (default 1 m) of its desired spacing; "
+        "None: not by the last link."),
+    "formation.last_link_s": ("s", "Time of the run at which a link was recorded last."),
     "formation.window_settling_s": (
         "s", "The same within each window between changes of topology (item: its start), counted from its start; "
         "None: not before its end."),
@@ -177,7 +179,9 @@ def of_formation(links: Series, starts: Floats, band_m: float) -> Values:
     worst = np.zeros(len(instants))
     np.maximum.at(worst, where, np.abs(error))
     instants *= INSTANT
-    values["formation.settling_s"] = settled(instants, worst, band_m)
+    after = settled(instants, worst, band_m)
+    values["formation.settling_s"] = None if after is None else float(instants[0] + after)
+    values["formation.last_link_s"] = float(instants[-1])
     for begin, end in zip(starts, [*starts[1:], np.inf], strict=True):
         inside = (instants >= begin - INSTANT / 2) & (instants < end - INSTANT / 2)
         if inside.any():

@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from trainctl.monitors import waiting
-from trainctl.railway import along, authority, interlocking, supervisor, zones
+from trainctl.railway import along, authority, interlocking, signs, supervisor, zones
 from trainctl.railway.authority import DRIVER_MARGIN_M, View
 from trainctl.railway.interlocking import Held
-from trainctl.railway.ways import Ways
+from trainctl.railway.ways import Ways, moved
+from trainctl.railway.ways import ways as laid
 from trainctl.record.columns import Call
 from trainctl.scenario.model import Model
 from trainctl.scenario.roster import Stop
@@ -96,6 +97,9 @@ class Traffic:
             (p.rails.index[order.edge], number[a], number[b]) for order in p.scenario.order for a, b in pairwise(order.trains)
         ]
         self.ways: Ways | None = None
+        self._limits(0.0)
+        routes = [[p.line.index[e] for e in route] for route in p.roster.routes]
+        self.first_ways, self.stops = laid(routes, p.line.start_m, p.line.length_m), list(p.roster.stops)
 
     def initial(self) -> State:
         """Before the run: trains that are placed have come."""
@@ -118,6 +122,12 @@ class Traffic:
         s = self.departures(t, seen, speed, self.arrivals(t, seen, s))
         if not self.looks:
             return s, nothing(len(speed))
+        self._limits(t)
+        if self.ways is not ways and self.stops_of.any():  # they changed: the places of stops count along them
+            self.stops = [
+                tuple(stop._replace(place=moved(self.first_ways, ways, i, stop.place)) for stop in stops)
+                for i, stops in enumerate(self.roster.stops)
+            ]
         for i in [] if s.came.all() else np.flatnonzero(~s.came & self._given_up(t) & ~self._given_up(t - self.step_s)).tolist():
             self.journal.event(t, "given_up", train=self.p.scenario.ids[i], planned_s=float(self.roster.depart[i]))
         s, stops, soon = self._stops(t, seen, speed, overrun, s)
@@ -206,7 +216,7 @@ class Traffic:
     def _entering_speed(self, i: int, ways: Ways, here: Seen, speed: Floats, view: View, s: State) -> float | None:
         """Speed with which a train can enter safely; None if it has to wait. ``view`` is that with the train at its place."""
         rules, v, roster = self.rules, self.roster.speed[i], self.roster
-        limit = float(roster.speed_factor[i] * self.p.rails.speed_mps[roster.edge[i]])
+        limit = float(roster.speed_factor[i] * self.limit[roster.edge[i]])
         on_edge = limit - self.p.driving.below_limit_mps
         wanted = float(min(self.p.cruise[i], max(on_edge, 0.0)) if np.isnan(v) else min(v, limit))
         there = np.flatnonzero(here.present & (here.edge == roster.edge[i]) & (np.arange(len(speed)) != i))
@@ -260,8 +270,19 @@ class Traffic:
 
     def stop_of(self, i: int, s: State) -> Stop | None:
         """The next stop of a train."""
-        stops, k = self.roster.stops[i], int(s.next_stop[i])
+        stops, k = self.stops[i], int(s.next_stop[i])
         return stops[k] if k < len(stops) else None
+
+    def _full(self, stop: Stop, s: State) -> bool:
+        """Whether a train that is to park at a stop finds no place."""
+        if not stop.parks or np.isinf(stop.lots):
+            return False
+        there = (self.stop_of(j, s) for j in np.flatnonzero(s.parked).tolist())
+        return sum(other is not None and other.name == stop.name for other in there) >= stop.lots
+
+    def _place(self, stop: Stop, s: State) -> float:
+        """Where a train that stops has to stand now [m]."""
+        return stop.place - (stop.waits_before if self._full(stop, s) else 0.0)
 
     def _further(self, stop: Stop, i: int) -> float:
         """How far behind a stop a train would come to a stand that passes it as fast as it may [m]; 0 if it is to stand there."""
@@ -280,8 +301,14 @@ class Traffic:
         )  # fmt: skip
         for i in np.flatnonzero(seen.present & (s.next_stop < self.stops_of)).tolist():
             stop = self.stop_of(i, s)
-            assert stop is not None
-            room = stop.place - float(seen.position[i])
+            while stop is not None and np.isnan(stop.place):
+                self.journal.event(t, "stop_dropped", train=self.p.scenario.ids[i], stop=stop.name)
+                s.next_stop[i] += 1
+                stop = self.stop_of(i, s)
+            if stop is None:
+                s.stopping[i] = False
+                continue
+            room = self._place(stop, s) - float(seen.position[i])
             if standing[i]:
                 if t < s.stands_until[i] - 1e-9 or s.parked[i]:
                     continue
@@ -292,7 +319,7 @@ class Traffic:
                 if stop is None:
                     s.stopping[i] = False
                     continue
-                room = stop.place - float(seen.position[i])
+                room = self._place(stop, s) - float(seen.position[i])
             while stop is not None and stop.passing and room <= 0.0:
                 late = self._called(i, stop, t, t, int(seen.edge[i]), s)
                 self.journal.event(
@@ -303,10 +330,10 @@ class Traffic:
             if stop is None:
                 s.stopping[i] = False
                 continue
-            if not stop.passing and speed[i] < STANDS_MPS and room < STOP_BAND_M:
+            if not stop.passing and speed[i] < STANDS_MPS and room < STOP_BAND_M and not self._full(stop, s):
                 s.stands_since[i], s.stands_until[i] = t, max(t + stop.duration, stop.until)
-                late = t - stop.planned
-                self.journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=room, **_late(late))
+                more = _late(t - stop.planned) | ({"parked": True} if stop.parks else {})
+                self.journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=room, **more)
                 s.parked[i] = stop.parks
                 continue
             trains.append(i)
@@ -336,6 +363,12 @@ class Traffic:
                 self.journal.call(i, Call(stops[k], k + 1, here, np.nan), self.p.rails.index[stops[k].edge])
 
     # Turns, and what is ahead
+
+    def _limits(self, t: float) -> None:
+        """Limit of every edge (E,) [m/s] that is to be kept over the coming step."""
+        # A limit that falls while a train comes near asks for more than either alone: half the braking is kept for the way there.
+        rate = 0.5 * float(np.min(self.requesting, initial=np.inf))
+        self.limit = signs.announced(self.p.signs, self.p.rails.speed_mps, t, self.step_s, rate)
 
     def _reach(self, speed: Floats) -> Floats:
         """How far ahead every train requests [m]: farther than it would brake for what it must not enter."""
@@ -392,6 +425,6 @@ class Traffic:
         if self.p.driven:
             horizon = max(horizon, self.p.driving.join_range_m)
         return authority.look(
-            ways, self.net, self.p.rails.speed_mps, self.roster.speed_factor, seen.row, seen.position, speed, self.length,
+            ways, self.net, self.limit, self.roster.speed_factor, seen.row, seen.position, speed, self.length,
             seen.present, horizon, held.room, interlocking.order(s.requests),
         )  # fmt: skip

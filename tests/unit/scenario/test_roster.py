@@ -285,7 +285,7 @@ def test_a_point_has_one_unit(mistakes: Callable[..., list[str]]) -> None:
 
 def test_what_is_not_followed_is_kept_for_the_reader(enrolled: Read) -> None:
     _, roster, _ = enrolled(nets.train("a", WAY, 0) + '<person id="p" depart="0"><walk edges="in"/></person>')
-    assert roster.notes == ("1 definitions of persons left out",)
+    assert roster.notes[0] == "1 definitions of persons left out"
 
 
 # Orders
