@@ -148,8 +148,12 @@ class Rails:
             found += (*self.chains[a, b], b)
         return np.array(found, np.int64)
 
-    def path(self, start: int, end: int) -> Ints | None:
-        """The shortest way from one edge to another without a change of direction, shape (W,), with both; None if there is none."""
+    def path(self, start: int, end: int, cost: Floats | None = None, closed: Collection[int] = ()) -> Ints | None:
+        """The shortest way from one edge to another without a change of direction, shape (W,), with both; None if there is none.
+
+        ``cost`` (E,) takes the place of the lengths; no way leads over the edges that are ``closed``.
+        """
+        cost = self.length_m if cost is None else cost
         came, heap = {start: -1}, [(0.0, start)]
         while heap:
             run, here = heappop(heap)
@@ -159,9 +163,11 @@ class Rails:
                     found.append(previous)
                 return np.array(found[::-1], np.int64)
             for there in self.onward[here]:
-                if there not in came:  # entered first from the nearest: an edge costs the same from wherever it is entered
+                if (
+                    there not in came and there not in closed
+                ):  # entered first from the nearest: an edge costs the same from wherever it is entered
                     came[there] = here
-                    heappush(heap, (run + float(self.length_m[there]), there))
+                    heappush(heap, (run + float(cost[there]), there))
         return None
 
 

@@ -6,16 +6,19 @@ A net goes into ``folder`` as ``a.net.xml`` with ``a.rou.xml`` and ``a.sumocfg``
 from __future__ import annotations
 
 import copy
+import math
 import random
 import subprocess
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import pytest
 
 from sumo_net import LineError
 from sumo_net.build import program
+from trainctl.traffic.files import is_time, seconds
 
 #: A train that can brake and pull with some 1 m/s2.
 TYPE = {
@@ -96,12 +99,20 @@ def both_ways(name: str, begin: str, end: str, **more: Any) -> dict[str, Any]:
 
 
 def traffic(folder: Path, body: str, types: str = EMU, end: int = 9000, begin: int = 0) -> None:
-    """Write ``a.rou.xml`` and ``a.sumocfg``."""
-    (folder / "a.rou.xml").write_text(f"<routes>{types}{body}</routes>")
+    """Write ``a.rou.xml``, sorted by departure times as SUMO wants it, and ``a.sumocfg``."""
+    given = sorted(ElementTree.fromstring(f"<routes>{body}</routes>"), key=_departs)
+    rows = "".join(ElementTree.tostring(element, "unicode") for element in given)
+    (folder / "a.rou.xml").write_text(f"<routes>{types}{rows}</routes>")
     (folder / "a.sumocfg").write_text(
         '<configuration><input><net-file value="a.net.xml"/><route-files value="a.rou.xml"/></input>'
         f'<time><begin value="{begin}"/><end value="{end}"/></time></configuration>'
     )
+
+
+def _departs(element: ElementTree.Element) -> float:
+    """When a train or the first of a flow departs [s]; what else there is comes before."""
+    said = element.get("depart", element.get("begin"))
+    return seconds(said) if said is not None and is_time(said) else -math.inf  # no time: a mistake that a test wants
 
 
 def flow(name: str, route: str, number: int, period: float, begin: float = 0.0, **more: Any) -> str:

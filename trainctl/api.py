@@ -45,7 +45,7 @@ HEADLINES = {
     "bounds.broken": "kinds of bound violated",
     "bounds.spacing_lower_margin_m": "minimum spacing above its lower bound [m]",
     "bounds.spacing_upper_margin_m": "minimum room below the upper spacing bound [m]",
-    "formation.settling_s": "all links within 1 m from [s]",
+    "formation.settling_s": "all links within 1 m from this time of the run [s]",
     "formation.final_error_m": "largest spacing error at the end [m]",
 }
 

@@ -18,7 +18,7 @@ from numba import njit
 from trainctl.signals import Floats, Ints
 
 #: What numbers are for: the second word of the counter. Disturbances, with steps of up to 64 bits, have 0.
-DISTURBANCE, NOISE, LOSS, JITTER = range(4)
+DISTURBANCE, NOISE, LOSS, JITTER, DEPARTURE, REROUTER = range(6)
 
 WORD = 0xFFFFFFFF
 

@@ -17,8 +17,8 @@ from trainctl.plants import disturbance
 from trainctl.railway.ways import under
 from trainctl.scenario.model import Model
 from trainctl.scenario.tables import Event
-from trainctl.signals import POSITION, SPEED, Bools, Demand, Disturbed, Floats, Formed, Messages, Motion, Seen, Start
-from trainctl.stages import control, driver, orders, plant, protect, record, topology, traffic
+from trainctl.signals import POSITION, SPEED, Bools, Demand, Disturbed, Floats, Formed, Ints, Messages, Motion, Seen, Start
+from trainctl.stages import control, driver, orders, plant, protect, record, rerouters, topology, traffic
 from trainctl.steps import Steps
 from trainctl.topology import exchange
 from trainctl.world import World
@@ -35,6 +35,7 @@ class State(NamedTuple):
     k: int  # steps done
     own: Floats  # (U, 2 or 3) position [m], speed [m/s], force [N] of every unit
     orders: orders.State
+    rerouters: Ints  # (n,) edge on which a train found no way round what is closed, -1: none
     traffic: traffic.State
     rule: Any  # of the formation rule: ``slots.State`` or ``convoys.State``
     formed: Formed
@@ -66,13 +67,15 @@ class Loop(Steps):
         self.world = world
         p, run = model, model.scenario.run
         self.disturbances = disturbance.signals(p.scenario.disturbance, p.scenario.ids, run.step_s, run.seed, p.worst)
+        self.rerouters = rerouters.Rerouters(p, journal)
         self.orders, self.traffic = orders.Orders(p, journal), traffic.Traffic(p, journal)
         self.topology = topology.Topology(p, journal)
         self.control, self.driver, self.plant = control.Control(p), driver.of(p), plant.of(p)
         self.protect = protect.Protect(p, journal, bool(len(self.disturbances.whole)) or self.plant.noisy)
         rule, formed = self.topology.rule.initial()
         self.state = State(
-            k=0, own=p.own.copy(), orders=self.orders.initial(), traffic=self.traffic.initial(), rule=rule, formed=formed,
+            k=0, own=p.own.copy(), orders=self.orders.initial(), rerouters=self.rerouters.initial(),
+            traffic=self.traffic.initial(), rule=rule, formed=formed,
             messages=exchange.silent(), demand=self.control.initial(), memory=(),
             commanded=np.full(len(p.scenario.ids), np.nan), plant=self.plant.initial(), watch=self.record.initial(),
         )  # fmt: skip
@@ -87,7 +90,10 @@ class Loop(Steps):
 
         # orders: new routes first, since they change the rows of everybody
         ordered, routes = self.orders.step(t, world.measure(), world.ways, own[leading, SPEED], s.formed.ahead, s.orders)
-        for i, edges in routes:
+        stuck, led = self.rerouters.step(
+            t, world.measure(), world.ways, own[leading, SPEED], s.rerouters, [i for i, _ in routes]
+        )  # fmt: skip
+        for i, edges in [*routes, *led]:
             world.route(i, edges)
         here, ways, speed = world.measure(), world.ways, own[leading, SPEED]
 
@@ -140,7 +146,7 @@ class Loop(Steps):
         world.move(moved.motion.displacement, p.scenario.run.step_s)
         formed = self.topology.rule.after(formed)
         return State(
-            s.k + 1, moved.own, ordered, going, rule, formed, moved.messages, demand, memory, s.commanded, moved.state, watch
+            s.k + 1, moved.own, ordered, stuck, going, rule, formed, moved.messages, demand, memory, s.commanded, moved.state, watch
         )  # fmt: skip
 
     def end(self) -> None:

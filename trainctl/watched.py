@@ -27,6 +27,7 @@ class State(NamedTuple):
     orders: orders.State
     entered: Bools  # (n,)
     edge: Ints  # (n,) where every train was last told of, -1: not on the net
+    stops: tuple[str, ...]  # at which each train stands, "" if at none
     energy: Floats  # (n, 6) J since the last row, as ``POWERS``
     watch: record.State
 
@@ -56,7 +57,8 @@ class Watched(Steps):
         self.orders, self.effort = orders.Orders(ruled, journal), Effort(p)
         n = len(p.scenario.ids)
         self.state = State(
-            k=0, orders=self.orders.initial(), entered=np.zeros(n, bool), edge=np.full(n, -1), energy=np.zeros((n, len(POWERS))),
+            k=0, orders=self.orders.initial(), entered=np.zeros(n, bool), edge=np.full(n, -1), stops=("",) * n,
+            energy=np.zeros((n, len(POWERS))),
             watch=self.record.initial(),
         )  # fmt: skip
         world.start()
@@ -110,7 +112,12 @@ class Watched(Steps):
             elif tracks[s.edge[i]] != tracks[edge[i]] and self.p.placed:
                 self.journal.event(t, "leave", train=ids[i], track=tracks[s.edge[i]])
                 self.journal.event(t, "join", train=ids[i], track=tracks[edge[i]])
-        return s._replace(entered=s.entered | seen.present, edge=edge)
+        for i, (was, now_at) in enumerate(zip(s.stops, self.world.stops, strict=True)):
+            if was and was != now_at:
+                self.journal.event(t, "stop_left", train=ids[i], stop=was)
+            if now_at and was != now_at:
+                self.journal.event(t, "stop_reached", train=ids[i], stop=now_at)
+        return s._replace(entered=s.entered | seen.present, edge=edge, stops=self.world.stops)
 
     def _record(self, t: float, ways: Ways, now: Observed, motion: Motion | None, due: bool, s: State) -> None:
         """One instant: alarms, then its row, if one is ``due``; ``motion`` is what followed."""

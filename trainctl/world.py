@@ -61,6 +61,10 @@ class SelfDriven(Protocol):
         """When every train is to enter [s], shape (n,)."""
 
     @property
+    def stops(self) -> tuple[str, ...]:
+        """What the stop is called at which each train stands now, "" if at none, n of them."""
+
+    @property
     def over(self) -> bool:
         """Whether every train has left, and nobody is still to come."""
 

@@ -25,6 +25,7 @@ from trainctl.studies import capacity
 from trainctl.sumo.baseline import Baseline
 
 SECTION = 24000.0
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
 
 def scenario(folder: Path, *, trains: int = 6, line: Mapping[str, Any] | None = None, **controller: Any) -> Path:
@@ -196,11 +197,17 @@ def test_traffic_of_a_sumo_configuration_runs_as_it_is(tmp_path: Path) -> None:
     trains = done.trains
     stood = trains[(trains["train"] == "stopping") & (trains["speed_mps"] == 0.0)]
     assert len(stood) >= 40 and stood["position_m"].nunique() == 1
+    (halt,) = (s for s in ElementTree.parse(tmp_path / "run" / "sumo" / "stops.xml").iter("stopinfo"))
+    assert (
+        stood["time_s"].min() <= float(halt.get("started", "nan")) < float(halt.get("ended", "nan")) <= stood["time_s"].max() + 1.0
+    )
     assert not (trains["gap_m"] < 0.0).any() and done.metrics["traffic.collisions"] == 0
     steps = trains.groupby("train", observed=True)["position_m"].diff().dropna()
     assert steps.min() >= 0.0 and steps.max() <= 45.0  # goes on without a jump from edge to edge
     program, environment = netconvert()
-    own = [str(program.parent / "sumo"), "-c", "run.sumocfg", "-e", "960", "--fcd-output", "own.xml", "--no-warnings"]
+    assert {e["stop"] for e in done.events if e["kind"] == "stop_left"}
+    own = [str(program.parent / "sumo"), "-c", str(SCENARIOS / "merging" / "merging.sumocfg"), "-e", "960", "--precision", "9",
+           "--railsignal-moving-block", "--fcd-output", "own.xml", "--no-warnings"]  # fmt: skip
     subprocess.run(own, cwd=tmp_path / "run" / "sumo", env=environment, check=True)
     theirs = {
         (float(step.get("time", "nan")), v.get("id")): float(v.get("speed", "nan"))
@@ -221,7 +228,7 @@ def test_trains_that_find_no_place_are_told(tmp_path: Path) -> None:
         ({"entry_m": 31000.0}, "controller.entry_m = 31000: off the line, 0 .. 30000 m"),
         ({"entry_m": None, "entry_speed_mps": 5.0}, "controller.entry_speed_mps = 5: only with entry_m"),
         ({"entry_m": None, "entry_every_s": 5.0}, "controller.entry_every_s = 5: only with entry_m"),
-        ({"block": "half"}, "controller.block = half: input should be 'fixed' or 'moving'"),
+        ({"block": "half"}, "controller.block = half: input should be 'files', 'fixed' or 'moving'"),
         ({"train_type": "TGV"}, "controller.train_type = TGV: input should be 'Freight'"),
         ({"signals_m": 30000.0}, "controller.signals_m = 30000.0: input should be less than or equal to 20000"),
     ],
@@ -271,7 +278,7 @@ def test_a_net_has_the_signals_it_has() -> None:
 
 def test_fixed_block_needs_signals(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"controller.block = fixed: merging.net.xml has no rail signals"):
-        runner.run(open_scenario("merging", {"controller.law": "sumo"}), tmp_path / "run")
+        runner.run(open_scenario("merging", {"controller.law": "sumo", "controller.block": "fixed"}), tmp_path / "run")
     assert not (tmp_path / "run.partial").exists()
 
 

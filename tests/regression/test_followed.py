@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from itertools import pairwise
 from typing import Any
 
 import nets
+import pandas as pd
 import pytest
 import tomli_w
 from beside import followed, plain
 
+from trainctl.metrics.traffic import metrics_of_fcd
 from trainctl.runner import resume, run
+from trainctl.runs.logs import vehicles
 from trainctl.runs.run import Run
 from trainctl.scenario.build import open_scenario
 
@@ -151,7 +155,8 @@ def test_trains_may_stand_in_additional_files_alone(folder):
 
 def test_what_is_not_followed_is_in_the_events_and_on_the_page(folder):
     found = followed(folder, nets.train("v", "ab", 0, flavour="sweet"), 20, "", ("numeric",))
-    [said] = events(found, "not_followed")
+    said, cruise = events(found, "not_followed")
+    assert cruise["what"] == "1 trains could run up to 40 m/s by their types and tracks: they cruise at reference.speed_mps = 35"
     assert said["what"] == "1 x <vehicle flavour>: not followed: it is not known here"
     from trainctl.report.page import page
 
@@ -166,6 +171,16 @@ def test_a_train_that_parks_lets_others_pass(folder):
     arrived = {e["train"]: e["time_s"] for e in events(found, "arrive")}
     [left] = events(found, "stop_left")
     assert arrived["y"] < left["time_s"] < arrived["x"]
+    # SUMO's log has the parked train on its lane all the time.
+    assert metrics_of_fcd(found.folder / "sumo" / "fcd.parquet")["fcd.spacing_min_m"] > 100.0
+    assert found.metrics.get("traffic.gap_min_m", 1e9) > 0.0
+    logs = ("--fcd-output", "fcd.xml", "--railsignal-moving-block")
+    plain(folder, "stop", *logs)
+    beside = folder / "with"
+    beside.mkdir()
+    for name, other in (("fcd.xml", "fcd.xml"), ("plain.xml", "stop.xml")):
+        (beside / other).write_bytes((folder / name).read_bytes())
+    assert metrics_of_fcd(beside / "fcd.xml")["fcd.spacing_min_m"] > 100.0 > metrics_of_fcd(folder / "fcd.xml")["fcd.spacing_min_m"]
     assert (found.folder / "sumo" / "collisions.xml").read_text().count("<collision ") == 0
     sumo = {row["id"]: float(row["arrival"]) for row in plain(folder, "tripinfo", "--railsignal-moving-block")}
     assert sumo["y"] < sumo["x"]
@@ -195,3 +210,149 @@ def test_a_run_goes_on_from_a_checkpoint_while_a_train_is_parked(folder):
     again, since = resume(folder / "cut")
     assert since == 250.0
     assert again.trains.equals(whole.trains) and again.events == whole.events
+
+
+ADDITIONAL = '<additional-files value="s.add.xml"/>'
+SIGN = '<variableSpeedSign id="s" lanes="bc_0"><step time="100" speed="10"/><step time="300" speed="-1"/></variableSpeedSign>'
+
+
+def test_variable_speed_signs_are_kept_to_from_their_time_on(folder):
+    """One train is on the edge when the limit falls, the other comes later; both have slowed down in time."""
+    (folder / "s.add.xml").write_text(f"<additional>{SIGN}</additional>")
+    found = followed(folder, nets.train("x", "ab bc cd", 0) + nets.train("y", "ab bc cd", 90), 500, ADDITIONAL)
+    on, t = found.trains.edge.astype(str) == "bc", found.trains.time_s
+    while_low = found.trains[on & (t >= 100.0) & (t < 300.0)]
+    assert while_low.speed_mps.max() <= 10.0 + 1e-9 and {"x", "y"} == set(while_low.train.astype(str))
+    assert found.trains[on & (t > 330.0)].speed_mps.max() > 15.0
+    assert not any(e["emergency"] for e in events(found, "supervisor"))
+    arrived = {e["train"]: e["time_s"] for e in events(found, "arrive")}
+    for row in plain(folder, "tripinfo", "--railsignal-moving-block"):
+        assert arrived[row["id"]] == pytest.approx(float(row["arrival"]), rel=0.15)
+
+
+def test_a_train_does_not_enter_faster_than_a_sign_will_let_it(folder):
+    (folder / "steps.xml").write_text('<vss><step time="5" speed="5"/></vss>')
+    sign = '<variableSpeedSign id="s" lanes="ab_0" file="steps.xml"/>'
+    (folder / "s.add.xml").write_text(f"<additional>{sign}</additional>")
+    found = followed(folder, sign + nets.train("x", "ab bc", 0, departSpeed="avg"), 30, ADDITIONAL, ("numeric",))
+    assert "1 x <variableSpeedSign> in route files: not followed" in events(found, "not_followed")[0]["what"]
+    assert events(found, "depart")[0]["speed_mps"] < 8.0
+
+
+@pytest.mark.parametrize("lots", [1, 2])
+def test_who_finds_no_place_in_a_parking_area_waits_before_it(folder, lots):
+    area = f'<parkingArea id="p" lane="bc_0" startPos="500" endPos="1000" roadsideCapacity="{lots}"/>'
+    (folder / "s.add.xml").write_text(f"<additional>{area}</additional>")
+    stop = '<stop parkingArea="p" duration="200"/>'
+    body = nets.train("x", "ab bc cd", 0, stop) + nets.train("y", "ab bc cd", 90, stop) + nets.train("z", "ab bc cd", 150)
+    found = followed(folder, body, 900, ADDITIONAL)
+    reached = {e["train"]: e["time_s"] for e in events(found, "stop_reached")}
+    arrived = sorted((e["time_s"], e["train"]) for e in events(found, "arrive"))
+    left = {e["train"]: e["time_s"] for e in events(found, "stop_left")}
+    assert (reached["y"] > left["x"]) == (lots == 1)
+    rows = plain(folder, "tripinfo", "--railsignal-moving-block")
+    assert [name for _, name in arrived] == [row["id"] for row in sorted(rows, key=lambda row: float(row["arrival"]))]
+    at = found.trains[(found.trains.train.astype(str) == "y") & (found.trains.time_s == left["x"] - 10.0)].position_m
+    assert (at.iloc[0] == pytest.approx(3500.0, abs=2.5)) == (lots == 1)
+
+
+@pytest.fixture
+def bypass(tmp_path):
+    """A line whose middle has a slower way round it, and a far way round that."""
+    nodes = {"a": (0, 0), "b": (4000, 0), "c": (7000, 0), "d": (10000, 0), "e": (5500, 800), "f": (5500, 3000)}
+    sides = {f"{x}{y}": (x, y) for x, y in ("ab", "bc", "cd", "be", "ec", "bf", "fc")}
+    nets.net(tmp_path, nodes, sides)
+    return tmp_path
+
+
+def rerouter(inside: str, more: str = "", edges: str = "ab", times: str = 'begin="0" end="9999"') -> str:
+    return f'<additional><rerouter id="r" edges="{edges}" {more}><interval {times}>{inside}</interval></rerouter></additional>'
+
+
+BC = '<closingReroute id="bc"/>'
+#: What is closed, the edges of both trains' ways (the second departs at 200 s).
+CLOSED = {
+    "always": (rerouter(BC), ["ab be ec cd"] * 2),
+    "two edges": (rerouter(f'{BC}<closingReroute id="be"/>'), ["ab bf fc cd"] * 2),
+    "for a time": (rerouter(BC, times='begin="0" end="100"'), ["ab be ec cd", "ab bc cd"]),
+    "while on the edge": (rerouter(BC, times='begin="20" end="900"'), ["ab be ec cd"] * 2),
+    "later": (rerouter(BC, times='begin="190" end="900"'), ["ab bc cd", "ab be ec cd"]),
+    "for others": (rerouter('<closingReroute id="bc" allow="rail"/>'), ["ab bc cd"] * 2),
+    "another type": (rerouter(BC, 'vTypes="none"'), ["ab bc cd"] * 2),
+    "off": (rerouter(BC, 'off="true"'), ["ab bc cd"] * 2),
+    "elsewhere": (rerouter(BC, edges="cd"), ["ab bc cd"] * 2),
+}
+
+
+@pytest.mark.parametrize("case", CLOSED)
+def test_trains_are_led_round_closed_edges(bypass, case):
+    """The stop behind the detour is made at its place."""
+    text, ways = CLOSED[case]
+    (bypass / "s.add.xml").write_text(text)
+    stop = '<stop lane="cd_0" endPos="1000" duration="20"/>'
+    body = nets.train("x", "ab bc cd", 0, stop) + nets.train("y", "ab bc cd", 200, stop)
+    found = followed(bypass, body, 900, ADDITIONAL)
+    trains = found.trains.astype({"train": str, "edge": str})
+    run_over = [" ".join(e for e in trains[trains.train == n].edge.unique() if e[0] != ":") for n in "xy"]
+    assert run_over == ways
+    plain(bypass, "vehroute", "--railsignal-moving-block", "--vehroute-output.last-route")
+    assert [row for row in re.findall(r'<route edges="([^"]*)"', (bypass / "plain.xml").read_text()) if row] == ways
+    stood = trains[(trains.speed_mps < 0.01) & (trains.edge == "cd")].groupby("train").position_m.first()
+    assert len(stood) == 2 and len(events(found, "stop_reached")) == 2
+    logged = {row["id"]: float(row["pos"]) for row in plain(bypass, "stop")}
+    fcd = metrics_of_stops(found)
+    assert fcd == pytest.approx(logged, abs=0.5)
+
+
+def metrics_of_stops(found: Run) -> dict[str, float]:
+    """Where on its edge every train stands when it has reached its stop, as SUMO logged it."""
+    rows = pd.concat(batch.to_pandas() for batch in vehicles(found.folder / "sumo" / "fcd.parquet")).astype({"id": str})
+    at = rows.set_index(["id", "time"]).pos
+    return {e["train"]: float(at[(e["train"], e["time_s"])]) for e in events(found, "stop_reached")}
+
+
+def test_a_stop_on_a_closed_edge_is_dropped_and_what_else_a_rerouter_does_is_named(bypass):
+    (bypass / "s.add.xml").write_text(rerouter(f'{BC}<destProbReroute id="bc"/>'))
+    halts = '<stop lane="bc_0" endPos="1000" duration="20"/><stop lane="cd_0" endPos="1000" duration="20"/>'
+    found = followed(bypass, nets.train("x", "ab bc cd", 0, halts), 600, ADDITIONAL)
+    assert [e["stop"] for e in events(found, "stop_dropped")] == ["bc"]
+    assert [e["stop"] for e in events(found, "stop_left")] == ["cd"]
+    assert "rerouter r: <destProbReroute>: not followed: trains keep their destinations" in [
+        e["what"] for e in events(found, "not_followed")
+    ]
+
+
+def test_who_cannot_leave_its_way_any_more_is_told(bypass):
+    (bypass / "s.add.xml").write_text(rerouter(BC))
+    found = followed(bypass, nets.train("x", "ab bc cd", 0, departPos=3700, departSpeed=30), 300, ADDITIONAL)
+    [refused] = events(found, "reroute_refused")
+    assert refused["reason"] == "edge bc is closed; it cannot brake before the switch any more"
+    assert len(events(found, "arrive")) == 1
+
+
+def test_a_run_goes_on_from_a_checkpoint_behind_a_detour(bypass):
+    (bypass / "s.add.xml").write_text(rerouter(BC))
+    nets.traffic(bypass, nets.train("x", "ab bc cd", 0, '<stop lane="cd_0" endPos="1000" duration="20"/>'))
+    cfg = bypass / "a.sumocfg"
+    cfg.write_text(cfg.read_text().replace("<configuration>", f"<configuration>{ADDITIONAL}"))
+    (bypass / "s.toml").write_text(tomli_w.dumps(nets.scenario("robust_constrained", 420)))
+    p = open_scenario(str(bypass / "s.toml"))
+    whole = run(p, bypass / "whole")
+
+    def dies(steps: int, _: int) -> None:
+        if steps >= 60:
+            raise RuntimeError("killed")
+
+    with pytest.raises(RuntimeError):
+        run(p, bypass / "cut", progress=dies, checkpoint_every_s=50.0)
+    again, since = resume(bypass / "cut")
+    assert since == 50.0 and len(events(again, "stop_left")) == 1
+    assert again.trains.equals(whole.trains) and again.events == whole.events
+
+
+def test_an_edge_is_closed_to_the_classes_named(bypass):
+    """Where SUMO would end with an error: it closes the edge to trains that depart later, too."""
+    (bypass / "s.add.xml").write_text(rerouter('<closingReroute id="bc" disallow="rail"/>'))
+    found = followed(bypass, nets.train("x", "ab bc cd", 0), 400, ADDITIONAL)
+    assert "be" in set(found.trains.edge.astype(str)) and events(found, "reroute")[0]["closed"] == "bc"
+    assert [e for e in events(found, "not_followed") if "where SUMO ends with an error" in e["what"]]

@@ -25,10 +25,15 @@ NEARER = 7.0
 class Listed:
     """A simulator whose trains are where a list says: position and speed of every train at every instant, NaN: not there."""
 
-    def __init__(self, p, instants, planned=(0.0, 0.0)):
+    def __init__(self, p, instants, planned=(0.0, 0.0), standing=()):
+        self.standing = dict(standing)
         self.line, self.instants, self.k, self.planned, self.routed = p.line, np.array(instants, float), 0, np.array(planned), []
         routes = [[p.line.index[e] for e in route] for route in p.roster.routes]
         self.ways = ways(routes, p.line.start_m, p.line.length_m)
+
+    @property
+    def stops(self):
+        return self.standing.get(self.k, ("", ""))
 
     @property
     def over(self):
@@ -102,6 +107,17 @@ def watched(p, world, folder):
 def force(v, after):
     """Per mass [m/s2]: what moves a train from one speed to the other."""
     return ROTATING * (after - v) + DAVIS[0] + DAVIS[1] * v + DAVIS[2] * v**2 + GRAVITY * SLOPE
+
+
+def test_stops_that_the_simulator_makes_are_told(prepared, tmp_path):
+    p, instants = prepared(), [[(3000.0, 0.0), (2000.0, 0.0)]] * 5
+    standing = {1: ("west", ""), 2: ("west", ""), 3: ("east", "mid")}
+    _, _, events = watched(p, Listed(p, instants, standing=standing), tmp_path)
+    told = [(e["time_s"], e["kind"], e["train"], e["stop"]) for e in events if e["kind"].startswith("stop_")]
+    assert told == [
+        (1.0, "stop_reached", "1", "west"), (3.0, "stop_left", "1", "west"), (3.0, "stop_reached", "1", "east"),
+        (3.0, "stop_reached", "2", "mid"), (4.0, "stop_left", "1", "east"), (4.0, "stop_left", "2", "mid"),
+    ]  # fmt: skip
 
 
 def test_the_force_of_a_row_is_told_from_the_step_that_follows(prepared, tmp_path):

@@ -15,9 +15,10 @@ RunFolder = Annotated[Path, typer.Argument(help="Run folder, as `trainctl run` m
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    new = typer.Typer(help="Start something of your own: a control law.", no_args_is_help=True)
+    new = typer.Typer(help="Start something of your own: a control law, a scenario.", no_args_is_help=True)
     app.add_typer(new, name="new")
     new.command("controller")(new_controller)
+    new.command("scenario")(new_scenario)
     app.command("export")(export)
     app.command("replay")(replay)
 
@@ -33,6 +34,23 @@ def new_controller(
     for path in controller(name, folder):
         say(path)
     say(f"\nNext:\n  trainctl run {folder / name}.toml\n  python -m pytest {folder}")
+
+
+def new_scenario(
+    sumocfg: Annotated[Path, typer.Argument(help="SUMO configuration with rail traffic.")],
+    out: Annotated[Path | None, typer.Option(help="File to make; default NAME.toml in the folder you are in.")] = None,
+) -> None:
+    """Write a scenario for the trains of a SUMO configuration: law, bounds and spacing fit the speeds found."""
+    from trainctl.scenario.build import open_scenario
+    from trainctl.scenario.starter import starter
+
+    file = out or Path(f"{sumocfg.stem}.toml")
+    if file.exists():
+        raise InputError(f"{file}: exists: choose another --out")
+    text = starter(sumocfg, file.parent)
+    file.write_text(text, encoding="utf-8")
+    open_scenario(str(file))
+    say(f"{file}\n\nNext:\n  trainctl check {file}\n  trainctl run {file}")
 
 
 def export(

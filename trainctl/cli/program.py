@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -87,6 +87,16 @@ def run(
         raise typer.Exit(1)
 
 
+def settling(metrics: Mapping[str, Any]) -> str:
+    """From when on all links were within their band, in words, as times of the run; "" where there were none."""
+    last = metrics.get("formation.last_link_s")
+    if not isinstance(last, int | float):
+        return ""
+    since = metrics.get("formation.settling_s")
+    words = "not by the end" if since is None else f"from {number(since)} s"
+    return words if last > float(metrics["run.duration_s"]) - 1e-6 else f"{words}, last link at {number(last)} s"
+
+
 def _summary(done: Run, model: Model) -> None:
     """Where the results lie, and whether the bounds held."""
     from trainctl.runs.outcome import summary
@@ -107,11 +117,12 @@ def _summary(done: Run, model: Model) -> None:
         ("bounds.speed_upper_margin_mps", "minimum room below the upper speed bound", "m/s"),
         ("bounds.input_lower_margin_mps2", "minimum input above its lower bound", "m/s2"),
         ("bounds.input_upper_margin_mps2", "minimum room below the upper input bound", "m/s2"),
-        ("formation.settling_s", "all links within 1 m from", "s"),
         ("formation.final_error_m", "largest spacing error at the end", "m"),
     ):
         if isinstance(metrics.get(key), int | float):
             fill(table, words, f"{number(metrics[key])} {unit}")
+    if words := settling(metrics):
+        fill(table, "all links within 1 m", words)
     for line in summary(done):
         fill(table, line.title, f"FAILED: {line.text}" if line.failed else line.text)
     show(table)
@@ -224,6 +235,9 @@ def plot(
     out: Annotated[Path | None, typer.Option(help="Where the figures go; default FOLDER/figures.")] = None,
     formats: Annotated[list[str] | None, typer.Option("--format", help="png, svg, pdf; repeatable; default png.")] = None,
     width: Annotated[Literal["single", "double"], typer.Option(help="A column of print (85 mm) or a page (178 mm).")] = "double",
+    clock: Annotated[bool, typer.Option("--clock", help="Time in hours and minutes of the run.")] = False,
+    kmh: Annotated[bool, typer.Option("--kmh", help="Speeds in km/h.")] = False,
+    caption: Annotated[bool, typer.Option("--caption", help="Title, law, version and seed below every figure.")] = False,
 ) -> None:
     """Draw all figures that apply to a run."""
     from trainctl.figures.catalogue import plot as draw
@@ -233,7 +247,7 @@ def plot(
     wrong = [f for f in wanted if f not in ("png", "svg", "pdf")]
     if wrong:
         raise InputError([f"--format {f}: must be one of png, svg, pdf" for f in wrong])
-    for path in draw(Run(folder), out or folder / "figures", wanted, width):
+    for path in draw(Run(folder), out or folder / "figures", wanted, width, clock=clock, kmh=kmh, caption=caption):
         say(path)
 
 

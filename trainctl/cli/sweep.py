@@ -123,7 +123,7 @@ class _Progress:
 def _summary(folder: Path, info: dict[str, Any]) -> None:
     """How many runs there are, and in which share of them a bound was violated."""
     from trainctl.cli.console import listing, show
-    from trainctl.studies.results import shares
+    from trainctl.studies.results import not_settled, shares
 
     told = {key: info[key] for key in ("complete", "refused", "failed") if info[key] or key == "complete"}
     say(f"{info['runs']} runs: " + ", ".join(f"{count} {word}" for word, count in told.items()))
@@ -142,6 +142,8 @@ def _summary(folder: Path, info: dict[str, Any]) -> None:
     for key, words in (("with_collisions", "trains collided"), ("with_gridlocks", "trains waited for each other in a circle")):
         if info[key]:
             say(f"in {info[key]} of {info['complete']} runs {words}")
+    if count := not_settled(folder):
+        say(f"in {count} of {info['complete']} runs the formation did not settle within 1 m")
     for reason in info["reasons"]:
         say(reason)
     say(f"results: {folder}/  (results.parquet, summary.png)")

@@ -1,7 +1,8 @@
 """SUMO's own trains: no law of ours. SUMO's ``Rail`` model drives under fixed or under moving block, the baseline to compare with.
 
 SUMO decides on every speed (its default speed mode stays on), we only read: see ``trainctl.watched``. Of the scenario it
-takes the line, the trains with their lengths, places and speeds, and the reroutes; of a SUMO configuration the traffic as it is.
+takes the line, the trains with their lengths, places and speeds, and the reroutes. A SUMO configuration runs as it is: with its
+own files, vTypes, signals, constraints, rerouters and options; ``block`` alone may change what it says of moving block.
 Masses, resistances and slopes serve to tell what the trains' motion costs; bounds are only watched; links, plant and reference
 play no part, but for the top speed.
 
@@ -39,8 +40,10 @@ LONGEST_BLOCK_M = 20_000.0
 class Params(Table):
     """Keys of ``[controller]`` with ``law = "sumo"``."""
 
-    block: Literal["fixed", "moving"] = Field(
-        "fixed", description="fixed: one train between two signals; moving: up to the train ahead (--railsignal-moving-block)."
+    block: Literal["files", "fixed", "moving"] | None = Field(
+        None,
+        description="fixed: one train between two signals, the default on a line; moving: up to the train ahead "
+        "(--railsignal-moving-block); files: as the options of network.sumocfg have it, the default there.",
     )
     signals_m: float | None = Field(
         None, ge=10, le=LONGEST_BLOCK_M,
@@ -48,9 +51,16 @@ class Params(Table):
     )  # fmt: skip
     train_type: Literal[
         "Freight", "ICE1", "ICE3", "MireoPlusB", "MireoPlusH", "NGT400", "NGT400_16", "RB425", "RB628", "REDosto7"
-    ] = Field("ICE3", description="SUMO's table of traction, resistance, mass and braking that drives the trains.")
+    ] = Field(
+        "ICE3",
+        description="SUMO's table of traction, resistance, mass and braking that drives the trains; those of network.sumocfg have"
+        " the vTypes of its files.",
+    )
     top_speed_mps: float | None = Field(
-        None, gt=0, description="Maximum speed of every train [m/s]; default its upper speed bound, else the reference's maximum."
+        None,
+        gt=0,
+        description="Maximum speed of every train [m/s]; default its upper speed bound, else the reference's maximum; not with "
+        "network.sumocfg.",
     )
     entry_m: float | None = Field(
         None, ge=0,
@@ -89,7 +99,10 @@ def unfit(scenario: Any) -> list[str]:
     given, network = scenario.controller.keys(), scenario.network
     if network.line is None and given.get("signals_m") is not None:
         found.append("controller.signals_m: a net has the signals it has; name a line, or build the net with signals_m")
+    if network.sumocfg is None and given.get("block") == "files":
+        found.append("controller.block = files: only with network.sumocfg")
     if network.sumocfg is not None:
+        found += [f"controller.{k}: the vTypes of network.sumocfg say so" for k in ("train_type", "top_speed_mps") if k in given]
         entry = [key for key in ("entry_m", "entry_speed_mps", "entry_every_s") if given.get(key)]
         found += [f"controller.{key}: network.sumocfg says where and when its trains enter" for key in entry]
     return found

@@ -13,6 +13,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, MultipleLocator
 
 from trainctl.signals import Floats
 
@@ -31,6 +33,25 @@ CROWD = 50  # lines
 FOCUS = 3.0
 #: More lines than this are coloured by a scale, and only some of them named.
 NAMED = len(COLOURS)
+
+#: Labels that stand in the legend; all others stand beside their line.
+COMMON = (
+    "desired", "reference", "cruising speed", "bound", "limit", "minimum allowed", "median", "all bounds held", "a bound violated",
+    "not settled",
+)  # fmt: skip
+#: Marks of lines at bounds and at events.
+BOUND, EVENT = "bound", "event"
+#: A bound farther from the data than so many times their range is left to the corner of the panel.
+FAR = 1.5
+#: Height of a line of text as a share of a panel's, and letters of a name beside a panel.
+LINE_SHARE, LETTERS = 0.062, 18
+#: Ground of words on data.
+PAPER: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.8}
+#: Steps of an axis in hours and minutes [s].
+CLOCK_S = (30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400)
+
+#: Metadata that differ from day to day or version to version, left out.
+UNDATED = ("Software", "Date", "CreationDate")
 
 #: Resolution of bitmaps [1/inch].
 DPI = 300
@@ -59,6 +80,114 @@ def panels(rows: int, width: str, height_mm: float = 42.0, **options: Any) -> tu
     return figure, list(axes[:, 0])
 
 
+def name_lines(figure: Figure, width: str) -> None:
+    """Name the lines of every panel: trains and links beside their ends, what else there is in one legend above."""
+    shared: dict[str, Any] = {}
+    for axes in figure.axes:
+        fit(axes)
+        beside = []
+        for handle in axes.get_legend_handles_labels()[0]:
+            if _is_common(str(handle.get_label())):
+                shared.setdefault(str(handle.get_label()), handle)
+            elif isinstance(handle, Line2D):
+                beside.append(handle)
+        _beside(axes, beside)
+    legend(figure, width, sorted(shared.values(), key=_order))
+
+
+def _beside(axes: Axes, lines: Sequence[Line2D]) -> None:
+    """Labels right of a panel, each as near to the end of its line as the others let it, in its colour."""
+    ends = []
+    for label, line in {str(line.get_label()): line for line in lines}.items():
+        parts = [part.get_data() for part in axes.lines if part.get_label() in (label, f"_{label}")]
+        x, y = (np.concatenate([np.asarray(part[k], float) for part in parts]) for k in (0, 1))
+        if (some := np.isfinite(x) & np.isfinite(y)).any():
+            k = int(np.argmax(np.where(some, x, -np.inf)))
+            share = axes.transAxes.inverted().transform(axes.transData.transform((x[k], y[k])))[1]
+            ends.append((round(float(np.clip(share, 0.0, 1.0)), 2), label, line.get_color()))
+    ends.sort(key=lambda end: (end[0], [-value for _, value, _ in _order_of(end[1])]))
+    for place, (_, label, colour) in zip(spread([end[0] for end in ends], LINE_SHARE), ends, strict=True):
+        axes.annotate(
+            label if len(label) <= LETTERS else f"{label[: LETTERS - 1]}…", (1.0, place), xycoords="axes fraction", xytext=(4, 0),
+            textcoords="offset points", fontsize=7, va="center", color=colour, annotation_clip=False,
+        )  # fmt: skip
+
+
+def spread(places: Sequence[float], apart: float) -> list[float]:
+    """Ascending places moved as little as needed, so that they stand ``apart`` within 0 to 1, or closer if they are too many."""
+    apart = min(apart, 1.0 / max(len(places) - 1, 1))
+    step = apart * np.arange(len(places))
+    low = np.asarray(places, float) - step  # of evenly spaced ones all are equal
+    up, down = np.maximum.accumulate(low), np.minimum.accumulate(low[::-1])[::-1]  # moved upwards only, and downwards only
+    middle = np.clip(0.5 * (up + down), 0.0, 1.0 - step.max(initial=0.0))
+    return list((middle + step).tolist())
+
+
+def fit(axes: Axes) -> None:
+    """Scale a panel to its data and to the bounds near it; bounds farther off stand in its corner as numbers."""
+    bounds = [line for line in axes.lines if line.get_gid() == BOUND]
+    if not bounds or not axes.get_autoscaley_on() or axes.get_yscale() != "linear":
+        return
+    drawn = [np.asarray(line.get_ydata(), float) for line in axes.lines if line.get_gid() not in (BOUND, EVENT)]
+    drawn += [np.asarray(path.vertices, float)[:, 1] for shade in axes.collections for path in shade.get_paths()]
+    values = np.concatenate(drawn) if drawn else np.zeros(0)
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return
+    low, high = float(values.min()), float(values.max())
+    reach = FAR * max(high - low, 0.02 * max(abs(low), abs(high)))
+    at = sorted({float(np.ravel(line.get_ydata())[0]) for line in bounds})
+    below, above = [v for v in at if v < low - reach], [v for v in at if v > high + reach]
+    if not below and not above:
+        return
+    near = [v for v in at if v not in below and v not in above]
+    low, high = min([low, *near]), max([high, *near])
+    spare = max(high - low, 1e-9)
+    axes.set_ylim(low - (0.15 if below else 0.06) * spare, high + (0.15 if above else 0.06) * spare)
+    for found, arrow, place, side in ((above, "↑", 0.97, "top"), (below, "↓", 0.03, "bottom")):
+        if found:
+            words = f"{arrow} bound {', '.join(f'{v:.4g}' for v in found)}"
+            axes.text(0.995, place, words, transform=axes.transAxes, ha="right", va=side, fontsize=6.5, color=GREY, bbox=PAPER)
+
+
+def time_axis(axes: Sequence[Axes], first: float, last: float, clock: bool) -> None:
+    """The common time axis of panels: seconds of the run, or hours and minutes of it."""
+    axes[-1].set_xlim(first, last)
+    axes[-1].set_xlabel("time [h:min]" if clock else "time [s]")
+    if clock:
+        step = next((s for s in CLOCK_S if (last - first) / s <= 9), 86400)
+        for panel in axes:
+            panel.xaxis.set_major_locator(MultipleLocator(step))
+            panel.xaxis.set_major_formatter(FuncFormatter(lambda t, _: on_the_clock(t)))
+
+
+def on_the_clock(time: float) -> str:
+    """Seconds of the run as hours and minutes, and seconds where there are some."""
+    minutes, seconds = divmod(round(time), 60)
+    return f"{minutes // 60:02d}:{minutes % 60:02d}" + (f":{seconds:02d}" if seconds else "")
+
+
+def name_places(axes: Axes, places: Sequence[tuple[float, str, str]]) -> None:
+    """Lines across a train graph where something lies, with its name on the right; stops come before what else is near them."""
+    low, high = axes.get_ylim()
+    inside = [place for place in places if low <= place[0] <= high]
+    for at, _, kind in inside:
+        axes.axhline(at, color=GREY, linewidth=0.7 if kind == "stop" else 0.4, linestyle="-" if kind == "stop" else ":", zorder=0.5)
+    kept: list[tuple[float, str, str]] = []
+    for place in sorted(inside, key=lambda place: place[2] != "stop"):
+        if len(kept) < 1.0 / LINE_SHARE:
+            kept.append(place)
+    kept.sort()
+    where = spread([(at - low) / (high - low) for at, _, _ in kept], LINE_SHARE)
+    for (at, name, kind), share in zip(kept, where, strict=True):
+        axes.annotate(
+            name if len(name) <= LETTERS else f"{name[: LETTERS - 1]}…", xy=(1.0, (at - low) / (high - low)), xytext=(1.012, share),
+            xycoords="axes fraction", textcoords="axes fraction", fontsize=7, va="center", annotation_clip=False,
+            color="black" if kind == "stop" else "#555555", fontweight="bold" if kind == "stop" else "normal",
+            arrowprops={"arrowstyle": "-", "linewidth": 0.4, "color": GREY, "shrinkA": 0, "shrinkB": 0},
+        )  # fmt: skip
+
+
 def legend(figure: Figure, width: str, handles: Sequence[Any] | None = None) -> None:
     """Put one legend above all panels, each label once."""
     if handles is None:
@@ -76,12 +205,19 @@ def legend(figure: Figure, width: str, handles: Sequence[Any] | None = None) -> 
     )  # fmt: skip
 
 
+def _is_common(label: str) -> bool:
+    """Whether a label belongs to all lines, or to a kind of them, and not to one train or link."""
+    return label in COMMON or label.startswith(("truth", "estimate"))
+
+
 def _order(handle: Any) -> list[tuple[int, int, str]]:
     """Lines by name, numbers by size, then what belongs to all lines."""
-    label = str(handle.get_label())
+    return _order_of(str(handle.get_label()))
+
+
+def _order_of(label: str) -> list[tuple[int, int, str]]:
     parts = re.findall(r"\d+|\D+", label)
-    common = label in ("desired", "reference", "cruising speed", "bound", "limit", "minimum allowed")
-    return [(int(common), 0, ""), *((0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts)]
+    return [(int(_is_common(label)), 0, ""), *((0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts)]
 
 
 def weights(count: int) -> list[float]:
@@ -142,7 +278,7 @@ def bound(axes: Axes, *values: float, label: str = "bound", **options: Any) -> N
     """Dashed lines at the finite ones of some values."""
     for value in values:
         if np.isfinite(value):
-            look: dict[str, Any] = {"color": GREY, "linestyle": (0, (5, 2)), "linewidth": 0.9, "label": label}
+            look: dict[str, Any] = {"color": GREY, "linestyle": (0, (5, 2)), "linewidth": 0.9, "label": label, "gid": BOUND}
             axes.axhline(value, **(look | options))
 
 
@@ -173,19 +309,27 @@ def focus(axes: Axes, time: Floats, low: Floats, high: Floats, after_s: float = 
 
 def room(axes: Axes, minimum: float) -> None:
     """Let the vertical axis span at least ``minimum``, so that rounding does not look like something."""
+    fit(axes)
     low, high = axes.get_ylim()
     if high - low < minimum:
         middle = 0.5 * (low + high)
         axes.set_ylim(middle - 0.5 * minimum, middle + 0.5 * minimum)
 
 
-def save(figure: Figure, path: Path, formats: Sequence[str]) -> list[Path]:
-    """Write a figure as ``<path>.<format>`` for each format; the same figure gives the same bytes."""
-    undated = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
+def save(figure: Figure, path: Path, formats: Sequence[str], title: str = "", origin: str = "") -> list[Path]:
+    """Write a figure as ``<path>.<format>`` for each format; the same figure gives the same bytes.
+
+    ``title`` and ``origin`` (what it was drawn from) go into the metadata of the file.
+    """
+    undated: dict[str, dict[str, Any]] = {
+        "png": {"Software": None, "Title": title or None, "Description": origin or None},
+        "svg": {"Date": None, "Title": title or None, "Description": origin or None},
+        "pdf": {"CreationDate": None, "Title": title or None, "Subject": origin or None},
+    }
     written = []
     for kind in formats:
         target = path.with_name(f"{path.name}.{kind}")
         with styled():
-            figure.savefig(target, dpi=DPI, metadata=undated.get(kind))
+            figure.savefig(target, dpi=DPI, metadata={k: v for k, v in undated[kind].items() if v is not None or k in UNDATED})
         written.append(target)
     return written

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from trainctl.figures import style
+from trainctl.signals import Bools
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.axes import Axes
 
 #: Metrics shown, as far as the runs have them: column -> label.
 SHOWN = {
@@ -21,18 +23,39 @@ SHOWN = {
     "bounds.speed_upper_margin_mps": "room below the\nupper speed [m/s]",
     "bounds.coupler_lower_margin_m": "room of couplers,\ncompressed [m]",
     "bounds.coupler_upper_margin_m": "room of couplers,\nstretched [m]",
-    "formation.settling_s": "settling time [s]",
+    "formation.settling_s": "all links within\n1 m from [s]",
     "formation.final_error_m": "spacing error\nat the end [m]",
 }
+
+SETTLING = "formation.settling_s"
 
 #: Values that differ by less are one value, and no axis is stretched over it.
 ROUNDING = 1e-6
 
 
+def not_settled(done: pd.DataFrame) -> Bools:
+    """Which of the complete runs have links that did not stay within their band, shape (runs,)."""
+    if SETTLING not in done.columns or "formation.final_error_m" not in done.columns:
+        return np.zeros(len(done), dtype=np.bool_)
+    out: Bools = np.isnan(done[SETTLING].to_numpy(float)) & np.isfinite(done["formation.final_error_m"].to_numpy(float))
+    return out
+
+
+def _crosses(panel: Axes, at: Any) -> None:
+    """Runs without a time, at the upper edge of their panel."""
+    if len(at):
+        panel.plot(
+            at, np.full(len(at), 0.97), "x", markersize=3.5, color="black", transform=panel.get_xaxis_transform(), clip_on=False,
+            label="not settled",
+        )  # fmt: skip
+        panel.set_title(f"{len(at)} not settled by the end", loc="right", fontsize=7)
+
+
 def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
     """Draw the complete runs over the first setting that is a number and varies, or else in order of size; violated bounds in red.
 
-    Runs that gave nothing are counted in the title: what they would have shown may differ from the rest.
+    Runs that gave nothing are counted in the title: what they would have shown may differ from the rest. Runs with links that did
+    not settle are crosses above the times of the others, and counted.
 
     Parameters
     ----------
@@ -46,25 +69,31 @@ def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
     done = frame[frame["status"] == "complete"]
     missing = frame["status"].value_counts().drop("complete", errors="ignore").sort_index()
     runs = f"{len(done)} of {len(frame)} runs complete, {', '.join(f'{n} {status}' for status, n in missing.items())}"
+    unsettled = not_settled(done)
     shown = [key for key in SHOWN if key in done.columns and np.isfinite(done[key].to_numpy(float)).any()]
+    if unsettled.any() and SETTLING not in shown:
+        shown = [key for key in SHOWN if key in (*shown, SETTLING)]
     axis = next((k for k in parameters if k != "run.seed" and done[k].dtype.kind in "if" and done[k].nunique() > 1), None)
     violated = done["violations"].to_numpy(float) > 0
     with style.styled():
         figure, axes = style.panels(max(1, len(shown)), "double", 34.0)
         for panel, key in zip(axes, shown, strict=False):
-            value = done[key].to_numpy(float)
+            value, never = done[key].to_numpy(float), unsettled if key == SETTLING else np.zeros(len(done), bool)
             if axis is None:
                 order = np.argsort(value, kind="stable")
-                at, value, red = np.arange(1, len(order) + 1), value[order], violated[order]
+                at, value, red, never = np.arange(1.0, len(order) + 1), value[order], violated[order], never[order]
             else:
                 at, red = done[axis].to_numpy(float), violated
                 places = np.unique(at)
-                middle = [np.nanmedian(value[at == x]) if np.isfinite(value[at == x]).any() else np.nan for x in places]
+                counted = np.where(never, np.inf, value)  # who did not settle is later than all who did
+                middle = [np.nanmedian(counted[at == x]) if (~np.isnan(counted[at == x])).any() else np.nan for x in places]
+                middle = [m if np.isfinite(m) else np.nan for m in middle]
                 panel.plot(places, middle, color=style.GREY, label="median")
             for chosen, colour, label in ((~red, 0, "all bounds held"), (red, 1, "a bound violated")):
                 if chosen.any():
                     panel.plot(at[chosen], value[chosen], ".", markersize=3, color=style.COLOURS[colour], label=label)
-            minimum, most = np.nanmin(value), np.nanmax(value)
+            _crosses(panel, at[never])
+            minimum, most = (np.nanmin(value), np.nanmax(value)) if np.isfinite(value).any() else (0.0, 0.0)
             if most - minimum < ROUNDING:
                 panel.set_ylim(minimum - 1.0, most + 1.0)
             if key.startswith("bounds."):

@@ -1,4 +1,4 @@
-"""Figures of whole trains: positions, spacings, speeds, inputs, the train graph."""
+"""Figures of whole trains: positions, spacings, speeds, inputs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from trainctl.figures import style
 from trainctl.runs.known import Facts, facts
@@ -18,15 +17,10 @@ from trainctl.runs.run import Run
 from trainctl.runs.series import INSTANT, Pairs, Series, pairs, series
 from trainctl.signals import Bools, Floats, leader_over
 
-#: Events that the train graph marks.
+#: Events that every panel over time marks, where trains do not come and go.
 SHOWN_EVENTS = ("topology", "reroute", "join", "leave", "fault", "limit")
-
-#: The same where trains come and go: marks on the train's own line, and their words.
-MARKS = {
-    "couple": ("^", "couples"), "uncouple": ("v", "uncouples"), "stop_reached": ("s", "stops"),
-    "conflict": ("D", "waits for its turn"), "reroute": ("o", "new route"), "reroute_refused": ("x", "route refused"),
-    "supervisor": ("|", "supervisor acts"),
-}  # fmt: skip
+#: More times than this are marked, but not named.
+NAMED_EVENTS = 6
 
 
 @dataclass
@@ -39,6 +33,33 @@ class Drawn:
     links: Pairs
     units: Series
     width: str  # "single" or "double", see style.WIDTHS_MM
+    clock: bool = False  # time in hours and minutes
+    kmh: bool = False  # speeds in km/h
+
+    @property
+    def per_mps(self) -> float:
+        """What speeds are multiplied with before they are drawn."""
+        return 3.6 if self.kmh else 1.0
+
+    @property
+    def speed_unit(self) -> str:
+        """Unit of the speeds drawn."""
+        return "km/h" if self.kmh else "m/s"
+
+    @cached_property
+    def origin(self) -> str:
+        """What the run is: title, law, version, seed, backend, and the sum that tells its scenario from others."""
+        info, versions = self.run.info, self.run.info.get("versions", {})
+        words = [
+            self.known.title or self.run.folder.name,
+            f"law {self.known.law}" if self.known.law else "",
+            f"trainctl {versions['trainctl']}" if versions.get("trainctl") else "",
+            f"SUMO {versions['sumo']}" if versions.get("sumo") and info.get("backend") == "sumo" else "",
+            f"backend {info['backend']}" if info.get("backend") else "",
+            f"seed {info['seed']}" if info.get("seed") is not None else "",
+            f"scenario {info['scenario_sha256'][:12]}" if info.get("scenario_sha256") else "",
+        ]
+        return ", ".join(word for word in words if word)
 
     @cached_property
     def instants(self) -> Floats:
@@ -64,9 +85,10 @@ class Drawn:
         return {name: {"color": self.colour[name], "linewidth": width} for name, width in zip(self.names, widths, strict=True)}
 
 
-def drawable(run: Run, width: str = "double") -> Drawn:
+def drawable(run: Run, width: str = "double", clock: bool = False, kmh: bool = False) -> Drawn:
     """Sort the tables of a run into series."""
-    return Drawn(run, facts(run), series(run.trains, "train"), pairs(run.links), series(run.units, "train", "unit"), width)
+    units = series(run.units, "train", "unit")
+    return Drawn(run, facts(run), series(run.trains, "train"), pairs(run.links), units, width, clock, kmh)
 
 
 def positions(drawn: Drawn) -> Figure:
@@ -78,7 +100,7 @@ def positions(drawn: Drawn) -> Figure:
     for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
         relative = position[rows] - (0.0 if reference is None else leader_over(reference, time[rows])[0])
         for panel, value in zip(axes, (position[rows] / 1000, relative / 1000), strict=False):
-            _in_and_out(panel, time[rows], value, inside[rows], drawn.colour[name], label)
+            in_and_out(panel, time[rows], value, inside[rows], drawn.colour[name], label)
     if reference is not None:
         instants = drawn.instants
         style.draw(axes[0], instants, leader_over(reference, instants)[0] / 1000, color="black", linestyle=":", label="reference")
@@ -137,24 +159,25 @@ def speeds(drawn: Drawn) -> Figure:
     return figure
 
 
-def _draw_trains(panel: Axes, drawn: Drawn, column: str, drawstyle: str) -> None:
+def _draw_trains(panel: Axes, drawn: Drawn, values: Floats, drawstyle: str) -> None:
     """Draw a column of every train over time into a panel."""
-    time, values = drawn.trains.column("time_s"), drawn.trains.column(column)
+    time = drawn.trains.column("time_s")
     for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
         style.draw(panel, time[rows], values[rows], label=label, drawstyle=drawstyle, **drawn.look[name])
 
 
 def draw_speeds(panel: Axes, drawn: Drawn) -> None:
     """Draw speeds, bounds and reference into a panel."""
-    style.bound(panel, *_distinct(drawn.known.speed_mps.values()))
-    _draw_trains(panel, drawn, "speed_mps", drawstyle="default")
+    factor = drawn.per_mps
+    style.bound(panel, *(factor * v for v in _distinct(drawn.known.speed_mps.values())))
+    _draw_trains(panel, drawn, factor * drawn.trains.column("speed_mps"), drawstyle="default")
     if drawn.known.reference is not None:
         instants = drawn.instants
-        reference = leader_over(drawn.known.reference, instants)[1]
+        reference = factor * leader_over(drawn.known.reference, instants)[1]
         style.draw(panel, instants, reference, color="black", linestyle=":", label="reference", zorder=3)
     if drawn.known.cruise_mps is not None:
-        style.bound(panel, drawn.known.cruise_mps, label="cruising speed", color="black", linestyle=":")
-    panel.set_ylabel("speed [m/s]")
+        style.bound(panel, factor * drawn.known.cruise_mps, label="cruising speed", color="black", linestyle=":")
+    panel.set_ylabel(f"speed [{drawn.speed_unit}]")
 
 
 def inputs(drawn: Drawn) -> Figure:
@@ -168,7 +191,7 @@ def inputs(drawn: Drawn) -> Figure:
 def draw_inputs(panel: Axes, drawn: Drawn) -> None:
     """Draw applied inputs, held until the next row, and bounds into a panel."""
     style.bound(panel, *_distinct(drawn.known.input_mps2.values()))
-    _draw_trains(panel, drawn, "input_mps2", drawstyle="steps-post")
+    _draw_trains(panel, drawn, drawn.trains.column("input_mps2"), drawstyle="steps-post")
     panel.set_ylabel(r"input [m/s$^2$]")
 
 
@@ -181,109 +204,18 @@ def speeds_and_inputs(drawn: Drawn) -> Figure:
     return figure
 
 
-def train_graph(drawn: Drawn) -> Figure:
-    """Time-distance diagram: one colour per train, one line style per track, switches marked, events as vertical lines.
-
-    Where trains come and go, full lines are trains in formations, and marks on the lines say what happened to them.
-    """
-    if drawn.known.traffic:
-        return _coming_and_going(drawn)
-    reference = drawn.known.reference
-    figure, axes = style.panels(1 if reference is None else 2, drawn.width, 60.0)
-    time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
-    track = drawn.trains.frame["track"].astype(str).to_numpy()
-    tracks, switched = sorted(set(track), key=lambda name: (len(name), name)), False
-    for name, rows in drawn.trains.slices():
-        at, on = time[rows], track[rows]
-        cuts = np.flatnonzero(on[1:] != on[:-1]) + 1
-        switched |= len(cuts) > 0
-        absolute = position[rows] / 1000
-        relative = absolute - (0.0 if reference is None else leader_over(reference, at)[0] / 1000)
-        for panel, value in zip(axes, (absolute, relative), strict=False):
-            for begin, end in zip([0, *cuts], [*cuts, len(at)], strict=True):
-                line = style.TRACK_STYLES[tracks.index(on[begin]) % len(style.TRACK_STYLES)]
-                style.draw(panel, at[begin : end + 1], value[begin : end + 1], color=drawn.colour[name], linestyle=line)
-            panel.plot(at[cuts], value[cuts], linestyle="none", marker="o", markersize=4, color=drawn.colour[name], zorder=4)
-            for k in cuts if panel is axes[-1] else ():
-                panel.annotate(
-                    f"{on[k - 1]}→{on[k]}", (at[k], value[k]), xytext=(6, 0), textcoords="offset points", fontsize=6.5,
-                    va="center", color=drawn.colour[name], zorder=5, bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6},
-                )  # fmt: skip
-    happened = {event["time_s"] for event in drawn.run.events if event["kind"] in SHOWN_EVENTS and event["time_s"] > time.min()}
-    for at_time in happened:
-        for panel in axes:
-            panel.axvline(at_time, color=style.GREY, linewidth=0.5, zorder=1)
-    axes[0].set_ylabel("position [km]")
-    if reference is not None:
-        axes[1].set_ylabel(r"$x_i - x_r$ [km]")
-    axes[-1].set_xlabel("time [s]")
-    axes[-1].set_xlim(drawn.instants[0], drawn.instants[-1])
-    handles = [
-        Line2D([], [], color=drawn.colour[name], label=label)
-        for name, label in zip(drawn.trains.names, style.labels(drawn.trains.names, "train "), strict=True)
-        if not label.startswith("_")
-    ]
-    styles = [
-        Line2D([], [], color=style.GREY, linestyle=style.TRACK_STYLES[k % len(style.TRACK_STYLES)], label=f"track {name}")
-        for k, name in enumerate(tracks)
-    ]
-    marks = []
-    if switched:
-        marks.append(Line2D([], [], color=style.GREY, linestyle="none", marker="o", markersize=4, label="changes track"))
-    if happened:
-        marks.append(Line2D([], [], color=style.GREY, linewidth=0.5, label="event"))
-    style.legend(figure, drawn.width, [*handles, *styles, *marks])
-    return figure
-
-
-def _coming_and_going(drawn: Drawn) -> Figure:
-    """Train graph of a net of any shape: positions run on along every way, so trains of different tracks may cross in it."""
-    figure, axes = style.panels(1, drawn.width, 90.0)
-    time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m") / 1000
-    inside = in_formation(drawn)
-    rows_of = dict(drawn.trains.slices())
-    for (name, rows), label in zip(rows_of.items(), style.labels(drawn.trains.names, "train "), strict=True):
-        _in_and_out(axes[0], time[rows], position[rows], inside[rows], drawn.colour[name], label)
-    marks = []
-    for kind, (mark, words) in MARKS.items():
-        events = [e for e in drawn.run.events if e["kind"] == kind and e.get("train") in rows_of]
-        for event in events:
-            rows = rows_of[event["train"]]
-            at = float(np.interp(event["time_s"], time[rows], position[rows]))
-            axes[0].plot(
-                event["time_s"], at, linestyle="none", marker=mark, markersize=4.5, color=drawn.colour[event["train"]],
-                markeredgecolor="black", markeredgewidth=0.5, zorder=4,
-            )  # fmt: skip
-        if events:
-            marks.append(Line2D(
-                [], [], color=style.GREY, linestyle="none", marker=mark, markersize=4.5, markeredgecolor="black",
-                markeredgewidth=0.5, label=f"{words} ({len(events)})",
-            ))  # fmt: skip
-    axes[0].set_ylabel("position [km]")
-    axes[0].set_xlabel("time [s]")
-    axes[0].set_xlim(drawn.instants[0], drawn.instants[-1])
-    handles = [
-        Line2D([], [], color=drawn.colour[name], label=label)
-        for name, label in zip(drawn.trains.names, style.labels(drawn.trains.names, "train "), strict=True)
-        if not label.startswith("_")
-    ]
-    alone = [] if inside.all() else [Line2D([], [], color=style.GREY, linestyle=":", linewidth=0.7, label="in no formation")]
-    style.legend(figure, drawn.width, [*handles, *alone, *marks])
-    return figure
-
-
 def speed_over_position(drawn: Drawn) -> Figure:
     """Speed against kilometrage, with the speed of the reference where it was."""
     figure, axes = style.panels(1, drawn.width, 52.0)
-    position, speed = drawn.trains.column("position_m") / 1000, drawn.trains.column("speed_mps")
+    position, speed = drawn.trains.column("position_m") / 1000, drawn.per_mps * drawn.trains.column("speed_mps")
     for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
         axes[0].plot(*style.envelope(position[rows], speed[rows]), label=label, **drawn.look[name])
     if drawn.known.reference is not None:
         where, reference, *_ = leader_over(drawn.known.reference, drawn.instants)
-        axes[0].plot(where / 1000, reference, color="black", linestyle=":", label="reference", zorder=3)
+        axes[0].plot(where / 1000, drawn.per_mps * reference, color="black", linestyle=":", label="reference", zorder=3)
     axes[0].set_xlabel("position [km]")
-    axes[0].set_ylabel("speed [m/s]")
-    style.legend(figure, drawn.width)
+    axes[0].set_ylabel(f"speed [{drawn.speed_unit}]")
+    style.name_lines(figure, drawn.width)
     return figure
 
 
@@ -293,7 +225,7 @@ def gaps(drawn: Drawn) -> Figure:
     time, gap = drawn.trains.column("time_s"), drawn.trains.column("gap_m") / 1000
     for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
         if np.isfinite(gap[rows]).any():
-            style.draw(axes[0], time[rows], gap[rows], label=f"{label} to the one ahead", **drawn.look[name])
+            style.draw(axes[0], time[rows], gap[rows], label=label, **drawn.look[name])
     wanted, minimum = set(), set()
     for (ahead, _), (_, rows) in zip(drawn.links.ends, drawn.links.slices(), strict=True):
         length = sum(drawn.known.length_m.get(ahead, (0.0,)))
@@ -307,7 +239,7 @@ def gaps(drawn: Drawn) -> Figure:
             axes[0].axhline(value / 1000, color="black", linestyle=":", linewidth=0.9, label="desired", zorder=3)
     if len(minimum) <= 4:
         style.bound(axes[0], *(value / 1000 for value in minimum), label="minimum allowed")
-    axes[0].set_ylabel("gap [km]")
+    axes[0].set_ylabel("gap to the one ahead [km]")
     _finish(figure, axes, drawn)
     return figure
 
@@ -321,14 +253,37 @@ def comparison(runs: Sequence[Run], names: Sequence[str], width: str = "double")
             draw_speeds(panel, one)
             panel.set_title(name, loc="left")
         axes[-1].set_xlabel("time [s]")
-        style.legend(figure, width)
+        style.name_lines(figure, width)
     return figure
 
 
 def _finish(figure: Figure, axes: Sequence[Axes], drawn: Drawn) -> None:
-    axes[-1].set_xlabel("time [s]")
-    axes[-1].set_xlim(drawn.instants[0], drawn.instants[-1])
-    style.legend(figure, drawn.width)
+    style.time_axis(axes, drawn.instants[0], drawn.instants[-1], drawn.clock)
+    mark_events(axes, drawn)
+    style.name_lines(figure, drawn.width)
+
+
+def mark_events(axes: Sequence[Axes], drawn: Drawn) -> None:
+    """Mark in every panel when something happened to the formation; the first panel says what. Not where trains come and go."""
+    if drawn.known.traffic:
+        return
+    kinds: dict[float, dict[str, None]] = {}
+    for event in drawn.run.events:
+        if event["kind"] in SHOWN_EVENTS and event["time_s"] > drawn.instants[0]:
+            kinds.setdefault(float(event["time_s"]), {})[event["kind"]] = None
+    for at in kinds:
+        for panel in axes:
+            panel.axvline(at, color=style.GREY, linewidth=0.5, zorder=1, gid=style.EVENT)
+    if len(kinds) > NAMED_EVENTS:
+        return
+    span, last = float(drawn.instants[-1] - drawn.instants[0]), -np.inf
+    for at, words in sorted(kinds.items()):
+        if at - last > 0.04 * span:  # else its words would lie on those before
+            axes[0].annotate(
+                ", ".join(words), (at, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 1), textcoords="offset points",
+                fontsize=6, color=style.GREY, ha="center", va="bottom",
+            )  # fmt: skip
+            last = at
 
 
 def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -363,10 +318,12 @@ def in_formation(drawn: Drawn) -> Bools:
     return out
 
 
-def _in_and_out(panel: Axes, time: Floats, value: Floats, inside: Bools, colour: Any, label: str) -> None:
+def in_and_out(panel: Axes, time: Floats, value: Floats, inside: Bools, colour: Any, label: str) -> None:
     """Full line where the train is in the formation, thin dotted where it is not."""
     style.draw(panel, time, np.where(inside, value, np.nan), color=colour, label=label)
     if not inside.all():
         outside = ~inside
         outside[1:] |= outside[:-1] & inside[1:]  # reach to the first row inside
-        style.draw(panel, time, np.where(outside, value, np.nan), color=colour, linestyle=":", linewidth=0.7, alpha=0.8)
+        style.draw(
+            panel, time, np.where(outside, value, np.nan), color=colour, linestyle=":", linewidth=0.7, alpha=0.8, label=f"_{label}"
+        )

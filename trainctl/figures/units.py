@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from trainctl.figures import style
-from trainctl.figures.trains import Drawn
+from trainctl.figures.trains import Drawn, mark_events
 from trainctl.metrics.values import at_least, at_most
 from trainctl.signals import Floats, leader_over
 
@@ -23,7 +23,7 @@ def couplers(drawn: Drawn) -> Figure:
     """Coupler displacements: shaded from minimum to maximum over the sub-steps, with the allowed range."""
     figure, axes = style.panels(1, drawn.width, 52.0)
     low, high = at_most(drawn.units, "coupler_min_m", "coupler_m"), at_least(drawn.units, "coupler_max_m", "coupler_m")
-    _bands(axes[0], drawn, drawn.units.column("coupler_m"), low, high, "coupler ")
+    _bands(axes[0], drawn, drawn.units.column("coupler_m"), low, high)
     style.bound(axes[0], *drawn.known.coupler_m)
     axes[0].set_ylabel("coupler displacement [m]")
     style.room(axes[0], 1e-3)
@@ -34,7 +34,7 @@ def coupler_forces(drawn: Drawn) -> Figure:
     """Coupler forces at the recorded instants, positive when pulling."""
     figure, axes = style.panels(1, drawn.width, 52.0)
     force = drawn.units.column("coupler_force_n") / 1000
-    _bands(axes[0], drawn, force, force, force, "coupler ")
+    _bands(axes[0], drawn, force, force, force)
     axes[0].set_ylabel("coupler force [kN]")
     style.room(axes[0], 0.1)
     return _finished(figure, axes, drawn)
@@ -44,7 +44,7 @@ def unit_forces(drawn: Drawn) -> Figure:
     """Forces of all units: shaded from minimum to maximum over the sub-steps, with the limits."""
     figure, axes = style.panels(1, drawn.width, 52.0)
     low, high = at_most(drawn.units, "force_min_n", "force_n"), at_least(drawn.units, "force_max_n", "force_n")
-    _bands(axes[0], drawn, drawn.units.column("force_n") / 1000, low / 1000, high / 1000, "unit ")
+    _bands(axes[0], drawn, drawn.units.column("force_n") / 1000, low / 1000, high / 1000)
     limits = {limit for row in drawn.known.traction_n.values() for limit in row}
     limits |= {-limit for row in drawn.known.braking_n.values() for limit in row}
     if len(limits) <= 4:
@@ -61,7 +61,7 @@ def positions(drawn: Drawn) -> Figure:
 
 def speeds(drawn: Drawn) -> Figure:
     """Speeds of all units and of the reference."""
-    return _over_time(drawn, "speed_mps", "speed [m/s]", 1.0, 1)
+    return _over_time(drawn, "speed_mps", f"speed [{drawn.speed_unit}]", 1.0 / drawn.per_mps, 1)
 
 
 def position_differences(drawn: Drawn) -> Figure:
@@ -129,7 +129,7 @@ def estimates(quantity: str, label: str) -> Callable[[Drawn], Figure]:
             spare = 0.1 * float(np.ptp(both[np.isfinite(both)])) + 1e-9
             axes[1].set_ylim(np.nanmin(both) - spare, np.nanmax(both) + spare)
         axes[1].set_title("where that estimate is worst after the start", loc="right", fontsize=7)
-        _bands(axes[2], drawn, guess - true, guess - true, guess - true, "unit ")
+        _bands(axes[2], drawn, guess - true, guess - true, guess - true)
         axes[2].set_ylabel("error [" + label.partition("[")[2])
         style.focus(axes[2], time, guess - true, guess - true)
         axes[0].set_xlim(drawn.instants[0], drawn.instants[-1])
@@ -145,7 +145,7 @@ def _worst_after_start(time: Floats, error: Floats) -> float:
     return float(time[int(np.argmax(size))])
 
 
-def _bands(panel: Axes, drawn: Drawn, value: Floats, low: Floats, high: Floats, what: str) -> None:
+def _bands(panel: Axes, drawn: Drawn, value: Floats, low: Floats, high: Floats) -> None:
     """Lines in the colour of their train, lighter for later units, with their extremes as a shade; trains in the legend."""
     time, shown = drawn.units.column("time_s"), set()
     for name, rows in drawn.units.slices():
@@ -153,7 +153,7 @@ def _bands(panel: Axes, drawn: Drawn, value: Floats, low: Floats, high: Floats, 
             continue
         train, _, unit = name.rpartition(".")
         colour = drawn.colour[train]
-        label = f"{what}s of train {train}".replace(" s ", "s ") if train not in shown else f"_{name}"
+        label = f"train {train}" if train not in shown else f"_{name}"
         shown.add(train)
         if np.any(low[rows] < high[rows]):
             (x, minimum), (_, maximum) = _floor(time[rows], low[rows], -1.0), _floor(time[rows], high[rows], 1.0)
@@ -174,7 +174,7 @@ def _floor(x: Floats, y: Floats, sign: float) -> tuple[Floats, Floats]:
 def _over_time(drawn: Drawn, column: str, label: str, scale: float, derivative: int) -> Figure:
     figure, axes = style.panels(1, drawn.width, 52.0)
     value = drawn.units.column(column) / scale
-    _bands(axes[0], drawn, value, value, value, "unit ")
+    _bands(axes[0], drawn, value, value, value)
     if drawn.known.reference is not None:
         instants = drawn.instants
         reference = leader_over(drawn.known.reference, instants)[derivative] / scale
@@ -205,12 +205,12 @@ def _between_units(panel: Axes, drawn: Drawn, column: str) -> None:
     for (name, rows), (after, behind) in pairwise(parts):
         if name.rpartition(".")[0] == after.rpartition(".")[0] and rows.stop - rows.start == behind.stop - behind.start:
             difference[rows] = value[rows] - value[behind]
-    _bands(panel, drawn, difference, difference, difference, "unit ")
+    _bands(panel, drawn, difference, difference, difference)
     style.focus(panel, drawn.units.column("time_s"), difference, difference)
 
 
 def _finished(figure: Figure, axes: list[Axes], drawn: Drawn) -> Figure:
-    axes[-1].set_xlabel("time [s]")
-    axes[-1].set_xlim(drawn.instants[0], drawn.instants[-1])
-    style.legend(figure, drawn.width)
+    style.time_axis(axes, drawn.instants[0], drawn.instants[-1], drawn.clock)
+    mark_events(axes, drawn)
+    style.name_lines(figure, drawn.width)
     return figure

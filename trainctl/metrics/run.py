@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from trainctl.errors import InputError
-from trainctl.metrics import driving, traffic
+from trainctl.metrics import driving, punctuality, traffic
 from trainctl.metrics.values import Values, at_least, at_most, put_worst
 from trainctl.monitors.outcome import GAP
 from trainctl.runs.known import UNBOUNDED, Facts, facts
@@ -41,7 +41,9 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
     "bounds.first_violation_s": ("s", "Time of the first recorded instant at which a bound is violated; absent if none is."),
     "bounds.first_violation_who": ("text", "Which bound of whom is violated at that instant."),
     "formation.settling_s": (
-        "s", "Time after which every link stays within the band (default 1 m) of its desired spacing; None: never."),
+        "s", "Time of the run from which every link that there is stays within the band (default 1 m) of its desired spacing; "
+        "None: not by the last link."),
+    "formation.last_link_s": ("s", "Time of the run at which a link was recorded last."),
     "formation.window_settling_s": (
         "s", "The same within each window between changes of topology (item: its start), counted from its start; "
         "None: not before its end."),
@@ -61,6 +63,7 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
     "watched.<name>_max": ("as named", "Maximum value over all sub-steps of a quantity that the law constrains."),
     **driving.DEFINITIONS,
     **traffic.DEFINITIONS,
+    **punctuality.DEFINITIONS,
 }  # fmt: skip
 
 
@@ -102,6 +105,8 @@ def metrics(run: Run, *, band_m: float = 1.0, speed_band: float = 0.02, section_
     values |= driving.of_comfort(trains)
     inside = [float(event["value"]) for event in run.events if event["kind"] == "violation" and event.get("bound") == GAP]
     values |= traffic.of_trains(trains, section_m, inside)
+    values |= punctuality.of_entries(run.events)
+    values |= punctuality.of_stops(run.stops, float(time.max()))
     try:
         values |= traffic.of_sumo(run.folder / "sumo")
     except InputError:
@@ -174,7 +179,9 @@ def of_formation(links: Series, starts: Floats, band_m: float) -> Values:
     worst = np.zeros(len(instants))
     np.maximum.at(worst, where, np.abs(error))
     instants *= INSTANT
-    values["formation.settling_s"] = settled(instants, worst, band_m)
+    after = settled(instants, worst, band_m)
+    values["formation.settling_s"] = None if after is None else float(instants[0] + after)
+    values["formation.last_link_s"] = float(instants[-1])
     for begin, end in zip(starts, [*starts[1:], np.inf], strict=True):
         inside = (instants >= begin - INSTANT / 2) & (instants < end - INSTANT / 2)
         if inside.any():

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,6 @@ TRIPINFO = {
     "routeLength": "traffic.sumo_route_length_mean_m",
     "waitingTime": "traffic.sumo_waiting_time_mean_s",
     "timeLoss": "traffic.sumo_time_loss_mean_s",
-    "departDelay": "traffic.sumo_depart_delay_mean_s",
 }
 
 DEFINITIONS: dict[str, tuple[str, str]] = {
@@ -50,7 +50,6 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
     TRIPINFO["routeLength"]: ("m", "Mean route length."),
     TRIPINFO["waitingTime"]: ("s", "Mean waiting time (speed below 0.1 m/s)."),
     TRIPINFO["timeLoss"]: ("s", "Mean delay against driving at the allowed speed."),
-    TRIPINFO["departDelay"]: ("s", "Mean delay of the departure."),
     "traffic.collisions": ("1", "Collisions that SUMO counted."),
     "traffic.teleports": ("1", "Vehicles that SUMO teleported."),
     "traffic.emergency_stops": ("1", "Emergency stops that SUMO counted."),
@@ -63,7 +62,11 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
     "fcd.speed_mean_mps": ("m/s", "FCD log: mean speed over all rows."),
     "fcd.speed_max_mps": ("m/s", "FCD log: maximum speed."),
     "fcd.standing_share": ("1", "FCD log: share of rows below 0.1 m/s."),
-    "fcd.spacing_min_m": ("m", "FCD log: minimum distance from front to front on one lane (needs pos and lane)."),
+    "fcd.spacing_min_m": (
+        "m",
+        "FCD log: minimum distance from front to front on one lane (needs pos and lane); of parked vehicles only"
+        " where nobody says when they parked: a stop-output beside the log, or the events of the run.",
+    ),
     "fcd.spacing_mean_m": ("m", "FCD log: mean of that distance."),
     "fcd.headway_min_s": ("s", "FCD log: minimum spacing over the follower's speed, for vehicles faster than 1 m/s."),
     "fcd.headway_mean_s": ("s", "FCD log: mean of that headway."),
@@ -124,6 +127,8 @@ def of_sumo(folder: Path) -> Values:
     if trips:
         sums, count = dict.fromkeys(TRIPINFO, 0.0), 0
         for _, attributes in elements(trips, "tripinfos", {"tripinfo"}):
+            if _number(trips, attributes, "arrival") < 0.0:  # under way when the run ended
+                continue
             count += 1
             for attribute in sums:
                 sums[attribute] += _number(trips, attributes, attribute)
@@ -161,10 +166,29 @@ def metrics_of_fcd(path: Path | str) -> Values:
     InputError
         Not an FCD log, damaged, or with document types or entities in it.
     """
-    return _of_rows(vehicles(Path(path)), Path(path))
+    return _of_rows(vehicles(Path(path)), Path(path), parked(Path(path)))
 
 
-def _of_rows(batches: Iterable[pa.Table], path: Path) -> Values:
+def parked(path: Path) -> dict[str, list[tuple[float, float]]]:
+    """When vehicles of an FCD log were off their lane [s], though it has them there: from a stop log beside it, or our events."""
+    found: dict[str, list[tuple[float, float]]] = {}
+    ours, stops = path.parent.parent / "events.jsonl", find_log(path.parent, "stop")
+    if path.parent.name == "sumo" and ours.is_file():
+        for event in map(json.loads, ours.read_text(encoding="utf-8").splitlines()):
+            times = found.setdefault(str(event.get("train")), [])
+            if event["kind"] == "stop_reached" and event.get("parked"):
+                times.append((event["time_s"], math.inf))
+            elif event["kind"] == "stop_left" and times and math.isinf(times[-1][1]):
+                times[-1] = times[-1][0], event["time_s"]
+    elif stops is not None:
+        for _, stop in elements(stops, "stops", {"stopinfo"}):
+            if stop.get("parking") == "1":
+                begin, end = (_number(stops, stop, key) for key in ("started", "ended"))
+                found.setdefault(stop["id"], []).append((begin, end if end >= begin else math.inf))
+    return {name: times for name, times in found.items() if times}
+
+
+def _of_rows(batches: Iterable[pa.Table], path: Path, parked: Mapping[str, Sequence[tuple[float, float]]]) -> Values:
     names: set[str] = set()
     steps = rows = standing = 0
     begin, end = np.inf, -np.inf
@@ -182,7 +206,7 @@ def _of_rows(batches: Iterable[pa.Table], path: Path) -> Values:
         rows, standing = rows + len(time), standing + int(np.count_nonzero(speed < 0.1))
         speed_sum, speed_max = speed_sum + float(speed.sum()), max(speed_max, float(speed.max()))
         if {"lane", "pos"} <= set(batch.column_names):
-            distance, follower = _spacings(batch)
+            distance, follower = _spacings(_on_lane(batch, parked))
             spacing.add(distance)
             headway.add(distance[follower > MOVING_MPS] / follower[follower > MOVING_MPS])
     if not rows:
@@ -198,9 +222,19 @@ def _of_rows(batches: Iterable[pa.Table], path: Path) -> Values:
     return values
 
 
-def _spacings(batch: pa.Table) -> tuple[Floats, Floats]:
+def _on_lane(batch: pa.Table, parked: Mapping[str, Sequence[tuple[float, float]]]) -> pa.Table:
+    """Rows of vehicles that are on a lane: one that is parked has left it."""
+    kept = np.asarray(pc.and_(batch["lane"].is_valid(), batch["pos"].is_valid()))
+    if parked:
+        time, name = batch["time"].to_numpy(), np.asarray(batch["id"].to_pylist(), dtype=object)
+        for who, times in parked.items():
+            for begin, end in times:
+                kept &= ~((name == who) & (time > begin) & (time < end))
+    return batch.filter(pa.array(kept))
+
+
+def _spacings(on_lane: pa.Table) -> tuple[Floats, Floats]:
     """Distance of each vehicle on a lane to the one ahead of it there, and its speed."""
-    on_lane = batch.filter(pc.and_(batch["lane"].is_valid(), batch["pos"].is_valid()))
     lane = on_lane["lane"].combine_chunks().dictionary_encode().indices.to_numpy(zero_copy_only=False)
     time, pos, speed = (on_lane[name].to_numpy() for name in ("time", "pos", "speed"))
     order = np.lexsort((pos, lane, time))

@@ -65,7 +65,7 @@ class Alarms:
 
     def new(self, row: Row, ways: Ways, here: Seen, s: State) -> Iterator[Alarm]:
         """What is violated in this row for the first time, as fields of an event; ``here`` is where the world has the trains."""
-        for alarm in chain(self._all(row, s), self.watch.violated(ways, here, row.speed, s.last)):
+        for alarm in chain(self._all(row, s), self.watch.violated(row.time, ways, here, row.speed, s.last)):
             yield from s.tally.once(row.time, **alarm)
 
     def counted(self, end: float, collisions: Sequence[Mapping[str, Any]], s: State) -> Iterator[tuple[float, Alarm]]:

@@ -15,6 +15,7 @@ from numba import njit
 from sumo_net import Line, Rails
 from trainctl.kernels import keep_by_sources
 from trainctl.monitors.outcome import GAP, LIMIT
+from trainctl.railway.signs import Signs, in_force
 from trainctl.railway.ways import Ways
 from trainctl.signals import Bools, Floats, Ints
 
@@ -91,16 +92,18 @@ def limits(track: Track, ways: Ways, row: Ints, s: Floats, length: Floats, prese
 class Watch:
     """Overlaps and overspeeds from step to step."""
 
-    def __init__(self, ids: Sequence[str], length: Floats, factor: Floats, rails: Rails, line: Line, net: bool) -> None:
+    def __init__(
+        self, ids: Sequence[str], length: Floats, factor: Floats, rails: Rails, line: Line, net: bool, signs: Signs
+    ) -> None:
         self.ids, self.length, self.factor, self.line, self.net = ids, length, factor, line, net
-        self.track = track(rails, None if net else line.tracks)
+        self.track, self.signs = track(rails, None if net else line.tracks), signs
 
     def initial(self) -> Floats:
         """Front of every train a step ago [m], shape (n,); NaN where it was not there."""
         return np.full(len(self.length), np.nan)
 
-    def violated(self, ways: Ways, seen: Seen, speed: Floats, last: Floats) -> Iterator[dict[str, Any]]:
-        """What is wrong now, as fields of an event; ``seen`` counts as the ways do, ``speed`` (n,) [m/s].
+    def violated(self, t: float, ways: Ways, seen: Seen, speed: Floats, last: Floats) -> Iterator[dict[str, Any]]:
+        """What is wrong at ``t`` [s], as fields of an event; ``seen`` counts as the ways do, ``speed`` (n,) [m/s].
 
         ``last`` (n,), where the fronts were a step ago, is overwritten in place.
         """
@@ -113,7 +116,8 @@ class Watch:
                 "bound": GAP, "who": "-".join(trains), "value": -depth, "limit": 0.0, "trains": trains,
                 **located(self.line, self.net, edge, place),
             }  # fmt: skip
-        limit, edge_of = limits(self.track, ways, seen.row, seen.position, self.length, seen.present)
+        shown = self.track._replace(limit=in_force(self.signs, self.track.limit, t))
+        limit, edge_of = limits(shown, ways, seen.row, seen.position, self.length, seen.present)
         limit = self.factor * limit
         for i in np.flatnonzero(seen.present & (speed > limit + ROUNDING)).tolist():
             yield {
@@ -124,7 +128,7 @@ class Watch:
 
 def of(p: Model) -> Watch:
     """The watch over the trains of a scenario."""
-    return Watch(p.scenario.ids, p.consists.train_length(), p.roster.speed_factor, p.rails, p.line, not p.placed)
+    return Watch(p.scenario.ids, p.consists.train_length(), p.roster.speed_factor, p.rails, p.line, not p.placed, p.signs)
 
 
 def located(line: Line, net: bool, edge: int, place: float) -> dict[str, Any]:

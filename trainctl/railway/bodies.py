@@ -172,27 +172,38 @@ def _approach(places: Places, j: int, row: int) -> int:
 
 @njit(cache=True)
 def _bodies(places: Places, virtual: bool) -> tuple[Ints, Ints, Floats, Ints, Bools]:
-    """Rows of ``Bodies``, counted first."""
+    """Rows of ``Bodies``."""
     n = len(places.row)
-    count = 0
-    for again in range(2):
-        train, other, room = np.empty(count * again, np.int64), np.empty(count * again, np.int64), np.empty(count * again)
-        sense, sure = np.empty(count * again, np.int64), np.ones(count * again, np.bool_)
-        count = 0
-        for i in range(n):
-            if places.front[i] >= 0:
-                begin = count
-                count = _in_the_way(places, virtual, i, again == 1, count, other, room, sense, sure)
-                if again:
-                    train[begin:count] = i
-    return train, other, room, sense, sure
+    free, count = 2 * n + 16, 0
+    train, other, room = np.empty(free, np.int64), np.empty(free, np.int64), np.empty(free)
+    sense, sure = np.empty(free, np.int64), np.ones(free, np.bool_)
+    for i in range(n):
+        if places.front[i] < 0:
+            continue
+        begin = count
+        count = _in_the_way(places, virtual, i, begin, other, room, sense, sure)
+        if count > len(other):  # not all have found room
+            more = 2 * count
+            train, other, room = _longer(train, begin, more), _longer(other, begin, more), _longer(room, begin, more)
+            sense, sure = _longer(sense, begin, more), _longer(sure, begin, more)
+            _in_the_way(places, virtual, i, begin, other, room, sense, sure)
+        train[begin:count] = i
+    return train[:count].copy(), other[:count].copy(), room[:count].copy(), sense[:count].copy(), sure[:count].copy()
+
+
+@njit(cache=True)
+def _longer(values, kept, size):  # type: ignore[no-untyped-def]
+    """The first ``kept`` values in an array of ``size``; for any type, so it states none."""
+    longer = np.empty(size, values.dtype)
+    longer[:kept] = values[:kept]
+    return longer
 
 
 @njit(cache=True)
 def _in_the_way(
-    places: Places, virtual: bool, i: int, write: bool, count: int, other: Ints, room: Floats, sense: Ints, sure: Bools
+    places: Places, virtual: bool, i: int, count: int, other: Ints, room: Floats, sense: Ints, sure: Bools
 ) -> int:  # fmt: skip
-    """Write what is in the way of ``i`` from row ``count`` on, if ``write``; the next free row."""
+    """Write what is in the way of ``i`` from row ``count`` on, as far as there are rows; the row after the last, there or not."""
     ways, size, s = places.ways, places.size, places.s
     inside = s[i] - ways.begin[places.row[i]]
     # What begins farther ahead is hidden, from the horizon on or by a train whose front is there; how many rows its way is shifted.
@@ -213,7 +224,7 @@ def _in_the_way(
                     continue
                 value = away + size[e] - min(places.depth[p], size[e])
                 if value <= hidden:
-                    if write:
+                    if count < len(other):
                         other[count], room[count], sense[count], sure[count] = j, value, -1, places.piece_row[p] != PERHAPS
                     count += 1
                 break
@@ -224,7 +235,7 @@ def _in_the_way(
                 if j == i or (here and not _deeper(places.depth[p], j, inside, i)):
                     continue
                 if away <= hidden:
-                    if write:
+                    if count < len(other):
                         other[count], room[count], sense[count], sure[count] = j, away, 0, places.piece_row[p] != PERHAPS
                     count += 1
                 break
@@ -237,7 +248,7 @@ def _in_the_way(
             if j != i and value <= hidden:
                 told = not here and rear < 0.0 and _told(places, i, k, j, r, inside)
                 if not told:
-                    if write:
+                    if count < len(other):
                         # While its rear still is on another track, its being ahead clears nothing here.
                         clipped = not virtual and not here and rear < 0.0
                         other[count], room[count], sense[count], sure[count] = j, value, 0 if clipped else 1, r != PERHAPS
@@ -260,8 +271,8 @@ def _in_the_way(
             else:
                 j = _first_to_join(places, i, own, guard)
         if j >= 0 and value <= places.horizon:
-            if write:
-                other[count], room[count], sense[count] = j, value, way
+            if count < len(other):
+                other[count], room[count], sense[count], sure[count] = j, value, way, True
             count += 1
     return count
 

@@ -74,6 +74,20 @@ def rerouted(old: Ways, train: int, row: int, edges: Sequence[int] | Ints, start
     )
 
 
+def moved(old: Ways, new: Ways, train: int, place: float) -> float:
+    """Where a place on the old way of a train [m] lies on its new one: on the same passage of the same edge; NaN if on none."""
+    a, b, c, d = old.first[train], old.first[train + 1], new.first[train], new.first[train + 1]
+    if np.isnan(place) or (b - a == d - c and np.array_equal(old.edge[a:b], new.edge[c:d])):
+        return place
+    row = int(np.searchsorted(old.begin[a:b], place, side="left")) - 1
+    edge = old.edge[a + max(row, 0)]
+    passage = int((old.edge[a : a + max(row, 0)] == edge).sum())
+    rows = np.flatnonzero(new.edge[c:d] == edge)
+    if passage >= len(rows):
+        return float("nan")
+    return float(new.begin[c + rows[passage]] + (place - old.begin[a + max(row, 0)]))
+
+
 @njit(cache=True)
 def under(ways: Ways, of_edge: Floats, row: Ints, first: Ints, position: Floats) -> Floats:
     """Value of the edge under every unit, shape (U,).

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-import sumo_net
-from sumo_net import Line, LineError
+from sumo_net import Line
+from trainctl.figures.corridors import line_of
 from trainctl.figures.trains import Drawn
 from trainctl.report.map import on_the_map
 from trainctl.report.panels import _hex, packed, told
@@ -38,7 +38,7 @@ def animation(drawn: Drawn) -> dict[str, Any]:
     split = drawn.trains
     if drawn.known.traffic:
         return _of_traffic(drawn)
-    line = _line(drawn)
+    line = line_of(drawn.run)
     categories = [str(name) for name in split.frame["track"].astype("category").cat.categories]
     tracks = list(line.track_ids) if line is not None and set(categories) <= set(line.track_ids) else categories
     instants = drawn.instants
@@ -105,19 +105,6 @@ def frames(instants: Floats, events: Sequence[float], trains: int) -> Floats:
     for k in (at - 1, at, at + 1):
         keep[np.clip(k, 0, len(instants) - 1)] = True
     return instants[keep]
-
-
-def _line(drawn: Drawn) -> Line | None:
-    """The line of the run if it can still be read, else None: then there are tracks but no crossovers."""
-    place = str(drawn.run.scenario.get("network", {}).get("line", "")) if (drawn.run.folder / "scenario.toml").exists() else ""
-    known = sumo_net.shipped()
-    nets = sorted((drawn.run.folder / "sumo").glob("*.net.xml"))
-    try:
-        if nets:
-            return Line.read(nets[0])
-        return Line.of(sumo_net.read_spec(known.get(place, place))) if place else None
-    except (LineError, OSError):
-        return None
 
 
 def _lateral(drawn: Drawn, line: Line | None, tracks: list[str]) -> Floats:

@@ -82,6 +82,11 @@ class Run:
         return self.table("links")
 
     @cached_property
+    def stops(self) -> pd.DataFrame:
+        """One row per train and stop; empty if no train stops."""
+        return self.table("stops", missing_is_empty=True)
+
+    @cached_property
     def events(self) -> list[dict[str, Any]]:
         """The lines of events.jsonl. A last line cut short by a kill is left out."""
         path = self.folder / "events.jsonl"

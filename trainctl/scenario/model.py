@@ -14,8 +14,9 @@ from sumo_net import Rails
 from trainctl import draws
 from trainctl.davis import resistance
 from trainctl.plants import disturbance
-from trainctl.railway import supervisor
+from trainctl.railway import signs, supervisor
 from trainctl.railway.authority import DRIVER_MARGIN_M
+from trainctl.railway.signs import Signs
 from trainctl.scenario import limits, promise
 from trainctl.scenario.tables import Scenario, TrafficTable
 from trainctl.signals import (
@@ -65,6 +66,16 @@ class Model:
         """The net as a graph, its edges numbered as those of the line."""
         rails: Rails = self.roster.rails
         return rails
+
+    @cached_property
+    def signs(self) -> Signs:
+        """Variable speed signs."""
+        return signs.signs(self.roster.signs, self.rails.index)
+
+    @property
+    def rerouted(self) -> bool:
+        """Whether trains may be given other routes than they begin with."""
+        return bool(self.scenario.event or self.roster.closings)
 
     @property
     def placed(self) -> bool:

@@ -18,7 +18,7 @@ import numpy as np
 
 from trainctl.davis import resistance
 from trainctl.plants import disturbance, shared
-from trainctl.railway import along, authority, supervisor
+from trainctl.railway import along, authority, signs, supervisor
 from trainctl.railway.supervisor import Assumed
 from trainctl.railway.ways import ways
 from trainctl.signals import GRAVITY, POSITION, SPEED, Floats
@@ -56,9 +56,9 @@ def top_speed(p: Model) -> Floats:
     if p.placed:
         highest: Floats = np.maximum(float(p.line.speed_mps.max()), start)
         return highest
-    limit, index = p.rails.speed_mps, p.line.index
+    limit, index = signs.highest(p.signs, p.rails.speed_mps), p.line.index
     routes = [float(limit[[index[e] for e in route]].max()) for route in p.roster.routes]
-    highest = np.array(routes) if not p.scenario.event else np.full(len(routes), limit.max())  # a reroute may lead anywhere
+    highest = np.array(routes) if not p.rerouted else np.full(len(routes), limit.max())  # a reroute may lead anywhere
     found: Floats = np.maximum(p.roster.speed_factor * highest, start)
     return found
 
@@ -70,7 +70,7 @@ def _slopes(p: Model) -> tuple[Floats, Floats]:
         rear = p.own[p.leading, POSITION] - p.consists.train_length()
         first = np.maximum(np.searchsorted(breaks, rear, side="right") - 1, 0)
         ahead = [slope[k:] for k in first.tolist()]
-    elif p.scenario.event or not p.rails.slope.any():
+    elif p.rerouted or not p.rails.slope.any():
         ahead = [p.rails.slope] * len(p.roster.routes)
     else:
         ahead = [p.rails.slope[[p.line.index[e] for e in route]] for route in p.roster.routes]

@@ -38,6 +38,9 @@ def find(name: str) -> Path:
     if path.suffix == ".toml" or path.exists():
         if not path.is_file():
             raise InputError(f"{name}: no such scenario file")
+        if path.suffix in (".sumocfg", ".cfg"):
+            cure = f"`trainctl new scenario {name}` writes one for its trains"
+            raise InputError(f"{name}: a SUMO configuration is no scenario: {cure}")
         return path
     known = shipped()
     if name not in known:

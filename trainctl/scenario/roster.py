@@ -14,10 +14,15 @@ import numpy as np
 from sumo_net import Line, LineError, Rails
 from sumo_net.layout import Gradient
 from trainctl.errors import InputError
+from trainctl.scenario import passages
 from trainctl.scenario.tables import Scenario, TrafficTable, Train, TrainType
-from trainctl.scenario.train_types import train_type
+from trainctl.scenario.train_types import fitted, train_type
 from trainctl.signals import Bools, Floats, Ints
+from trainctl.traffic.closings import Closing
 from trainctl.traffic.read import Configuration, Departure, read_traffic
+
+#: Name of the [train_type] of all vTypes without data of their own.
+REST = "*"
 
 #: A train that stops at the end of its way stands this far before it [m]; nearer than 0.1 m it would have left.
 STANDS_SHORT_M = 0.2
@@ -32,6 +37,15 @@ class Stop(NamedTuple):
     name: str
     passing: float = 0.0  # m/s, it does not stand but passes with at most this speed; 0: it stands
     parks: bool = False  # it leaves the track meanwhile, and others pass
+    lots: float = math.inf  # so many trains can park at the places of this name
+    waits_before: float = 0.0  # m, where a train waits that finds none
+    planned: float = math.nan  # s, arrival; NaN: none is planned
+    edge: str = ""  # the platform: where it stands
+
+    def late(self, arrival: float, departure: float = math.nan) -> float:
+        """How long after the plan a train leaves [s], or comes, where no departure is planned or none has been; NaN: no plan."""
+        leaves = departure - self.until
+        return leaves if math.isfinite(leaves) else arrival - self.planned
 
 
 class Roster(NamedTuple):
@@ -51,6 +65,9 @@ class Roster(NamedTuple):
     vclass: tuple[str, ...]
     patience: float  # s, who cannot enter for longer does not come; inf: all come
     notes: tuple[str, ...]  # what of the configuration is not followed
+    signs: tuple[tuple[float, str, float], ...]  # variable speed signs: from when on [s], edge, limit [m/s]
+    closings: tuple[Closing, ...]  # edges closed for a time, round which trains are led
+    source: str  # the SUMO configuration; "" for [[train]] tables
     rails: Rails
     placed: bool  # by [[train]] tables, all there from the start; else they come and go
 
@@ -64,7 +81,7 @@ def placed(scenario: Scenario, line: Line) -> Roster:
         arrival=np.full(n, np.inf), speed=np.array([t.speed_mps for t in scenario.train], float), like=("",) * n,
         top_speed=np.full(n, np.inf), speed_factor=np.ones(n),
         routes=tuple(line.route(t.track, t.position_m) for t in scenario.train), stops=((),) * n, cooperates=np.ones(n, bool),
-        vclass=("rail",) * n, patience=np.inf, notes=(), rails=Rails.of(line), placed=True,
+        vclass=("rail",) * n, patience=np.inf, notes=(), signs=(), closings=(), source="", rails=Rails.of(line), placed=True,
     )  # fmt: skip
 
 
@@ -90,6 +107,12 @@ def from_tables(data: Mapping[str, Any], net: Path) -> Roster:
         vclass=tuple(data["vclass"]),
         patience=float(data["patience"]),
         notes=tuple(data["notes"]),
+        signs=tuple((float(t), str(edge), float(v)) for t, edge, v in data["signs"]),
+        closings=tuple(
+            Closing(tuple(at), str(closed), float(begin), float(end), float(share), tuple(types), tuple(classes))
+            for at, closed, begin, end, share, types, classes in data["closings"]
+        ),
+        source=str(data["source"]),
         rails=Rails.read(net, {e for route in data["routes"] for e in route}),
         placed=False,
     )
@@ -164,6 +187,11 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
                               traffic.kinds[d.kind].max_speed_mps, share * float(rails.speed_mps[way[0]])),
             )
         )  # fmt: skip
+    if not found:
+        found += passages.mistakes(
+            scenario.order, dict(zip(ids, routes, strict=True)),
+            {rails.edges[e]: rails.edges[f] for e, f in enumerate(rails.twin.tolist()) if f >= 0},
+        )  # fmt: skip
     if found:
         raise InputError(list(dict.fromkeys(found)))
     departures = traffic.departures
@@ -181,7 +209,16 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         cooperates=together,
         vclass=tuple(traffic.kinds[d.kind].vclass for d in departures),
         patience=traffic.patience_s,
-        notes=traffic.notes,
+        notes=_changes(scenario, traffic)
+        if scenario.controller.law == "sumo"
+        else (
+            *traffic.notes,
+            *fitted(kind for name, kind in traffic.kinds.items() if name not in scenario.train_type),
+            *_slower(scenario, traffic, rails, routes),
+        ),
+        closings=tuple(c._replace(begin=c.begin - traffic.begin_s, end=c.end - traffic.begin_s) for c in traffic.closings),
+        source=str((folder / str(scenario.network.sumocfg)).resolve()),
+        signs=tuple((t - traffic.begin_s, edge, v) for t, edge, v in traffic.signs),
         rails=rails,
         placed=False,
     )
@@ -212,10 +249,10 @@ def _events(scenario: Scenario, ids: list[str], rails: Rails) -> list[str]:
 
 def _types(scenario: Scenario, traffic: Configuration) -> tuple[dict[str, TrainType], list[str]]:
     """Data of every vType that runs: the scenario's own, else what the vType says of itself."""
-    types, found = dict(scenario.train_type), []
+    types, found = {name: kind for name, kind in scenario.train_type.items() if name != REST}, []
     for name in dict.fromkeys(d.kind for d in traffic.departures):
         if name not in types:
-            kind = train_type(traffic.kinds[name])
+            kind = train_type(traffic.kinds[name], scenario.train_type.get(REST))
             if isinstance(kind, list):
                 found += kind
             else:
@@ -239,10 +276,41 @@ def _stops(departure: Departure, rails: Rails, way: Ints, begin: Floats, begin_s
             raise ValueError(f"stop on edge {stop.edge} at {stop.position_m:g} m: lies behind the departure or the stop before")
         row, last = row + int(ahead[0]), stop.position_m
         until = -math.inf if stop.until_s is None else stop.until_s - begin_s
-        found.append(
-            Stop(float(begin[row] + stop.position_m), stop.duration_s, until, stop.name or stop.edge, stop.pass_mps, stop.parks)
-        )
+        planned = math.nan if stop.arrival_s is None else stop.arrival_s - begin_s
+        lots, depth = (math.inf, 0.0) if stop.area is None else (float(stop.area.lots), stop.area.depth_m)
+        place, name = float(begin[row] + stop.position_m), stop.name or stop.edge
+        found.append(Stop(place, stop.duration_s, until, name, stop.pass_mps, stop.parks, lots, depth, planned, stop.edge))
     return tuple(found)
+
+
+def _changes(scenario: Scenario, traffic: Configuration) -> tuple[str, ...]:
+    """What SUMO's own trains do otherwise than the files of their configuration say."""
+    step, block = scenario.run.step_s, scenario.controller.keys().get("block", "files")
+    found = [f"option step-length = {traffic.step_s:g}: run.step_s = {step:g} instead"] if traffic.step_s != step else []
+    if block != "files":
+        found.append(f"option railsignal-moving-block: controller.block = {block} instead")
+    if traffic.drawn:
+        found.append(f"flows {', '.join(traffic.drawn[:8])}: SUMO draws their trains itself, so none of them is planned for a time")
+    return (*found, "options time-to-teleport and collision.action: trains are never teleported, none is removed that collides")
+
+
+def _slower(scenario: Scenario, traffic: Configuration, rails: Rails, routes: list[tuple[str, ...]]) -> list[str]:
+    """What the scenario's cruising speed keeps trains from that their files let run faster."""
+    cruise = scenario.reference.speed_mps
+    if cruise is None:
+        return []
+    limit = dict(zip(rails.edges, rails.speed_mps.tolist(), strict=True))
+    fastest = [
+        min(kind.max_speed_mps, min(kind.speed_factor, 1.0) * max(limit[e] for e in route))
+        for kind, route in zip((traffic.kinds[d.kind] for d in traffic.departures), routes, strict=True)
+    ]
+    slowed = [v for v in fastest if v > cruise]
+    if not slowed:
+        return []
+    return [
+        f"{len(slowed)} trains could run up to {max(slowed):.4g} m/s by their types and tracks: they cruise at"
+        f" reference.speed_mps = {cruise:g}"
+    ]
 
 
 def _before_the_end(stops: tuple[Stop, ...], end: float) -> tuple[Stop, ...]:

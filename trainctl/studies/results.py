@@ -79,6 +79,16 @@ def shares(folder: Path, varied: Sequence[str]) -> list[dict[str, Any]]:
     return found
 
 
+def not_settled(folder: Path) -> int:
+    """Complete runs with links that did not stay within their band by the end."""
+    import pandas as pd
+
+    from trainctl.figures.sweep import not_settled as of
+
+    frame = pd.read_parquet(folder / RESULTS)
+    return int(of(frame[frame["status"] == "complete"]).sum())
+
+
 def _plain(value: Any) -> Any:
     """Lists and tables as JSON text."""
     return json.dumps(value, default=str) if isinstance(value, list | dict) else value

@@ -6,16 +6,18 @@ Nothing is commanded but reroutes, so the trains move as in SUMO run without us.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import libsumo
 import numpy as np
 
-from trainctl.errors import CouplingError
-from trainctl.railway.ways import ways
+from sumo_net.netfile import RAIL
+from trainctl.errors import CouplingError, InputError, SimulatorError
+from trainctl.railway.ways import rerouted, ways
 from trainctl.scenario.model import Model
 from trainctl.signals import Bools, Floats, Ints, Observed, Seen
-from trainctl.sumo.baseline_files import departures, verify_signals, write_configuration, write_routes
-from trainctl.sumo.session import TOLERANCE_M, Session
+from trainctl.sumo.baseline_files import departures, verify_signals, write_configuration, write_own_configuration, write_routes
+from trainctl.sumo.session import LOGS, TOLERANCE_M, Session
 
 #: How far ahead SUMO is asked for the next train on a net [m].
 LOOK_M = 20_000.0
@@ -43,19 +45,28 @@ class Baseline(Session):
         run, line = p.scenario.run, p.line
         super().__init__(line, net, folder, run.step_s, run.steps, run.record_every_s)
         verify_signals(p)
-        self.p, self.ids, self.departures = p, p.scenario.ids, departures(p)
+        self.p, self.ids = p, p.scenario.ids
+        self.departures = departures(p) if p.placed else []
+        if any(p.roster.stops):
+            self.logs = LOGS | {"stop-output": "stops.xml"}
         self.number = {name: i for i, name in enumerate(self.ids)}
         self.length = p.consists.train_length()
         self.track = np.array([line.track_ids.index(t) for t in line.tracks], np.int64)
-        self.ways = ways([[line.index[e] for e in d.route] for d in self.departures], line.start_m, line.length_m)
+        routes = [d.route for d in self.departures] if p.placed else p.roster.routes
+        self.ways = ways([[line.index[e] for e in route] for route in routes], line.start_m, line.length_m)
         row, there = self.ways.first[:-1].copy(), np.zeros(len(self.ids), bool)
-        position = self.ways.begin[row] + np.array([d.position_m for d in self.departures])
+        position = self.ways.begin[row] + (
+            np.array([d.position_m for d in self.departures]) if p.placed else p.roster.lane_position
+        )
+        self.stops = ("",) * len(self.ids)
+        self.since = 0.0  # s, when SUMO begins
+        self.others: dict[str, str] = {}  # vClass of who runs beside the trains that are known
         self.seen = Seen(position, self.ways.edge[row], row, there)  # where they will come
 
     @property
     def planned(self) -> Floats:
         """When every train is to enter [s], shape (n,)."""
-        return np.array([d.depart for d in self.departures])
+        return np.array([d.depart for d in self.departures]) if self.p.placed else self.p.roster.depart
 
     @property
     def over(self) -> bool:
@@ -65,8 +76,15 @@ class Baseline(Session):
     def start(self) -> None:
         """Let the first trains in."""
         self._ready()
-        write_routes(self.p, self.departures, self.folder / "trains.rou.xml")
-        self._begin(write_configuration(self.p, self.net.name, self.folder))
+        if self.p.placed:
+            write_routes(self.p, self.departures, self.folder / "trains.rou.xml")
+            self._begin(write_configuration(self.p, self.net.name, self.folder))
+        else:
+            try:
+                self._begin(write_own_configuration(self.p, self.net.name, self.folder))
+            except SimulatorError as error:
+                raise InputError(f"{self.p.file}: network.sumocfg: {error}") from None
+            self.since = self._time()
         self._read()
         self._verify_placed()
 
@@ -79,16 +97,36 @@ class Baseline(Session):
         """Where every train is now, how fast, and behind whom."""
         return Observed(self.seen, self.speed, self.ahead, self.spacing)
 
+    def messages(self) -> list[tuple[float | None, str]]:
+        """As of ``World``."""
+        found = [(None if at is None else at - self.since, text) for at, text in super().messages()]
+        if trains := [name for name, vclass in self.others.items() if vclass in RAIL]:
+            some = f"{', '.join(trains[:8])}{' ...' if len(trains) > 8 else ''}"
+            found.append((None, f"{len(trains)} trains that SUMO draws otherwise than duarouter are not recorded: {some}"))
+        return found
+
+    def collisions(self) -> list[dict[str, Any]]:
+        """As of ``World``."""
+        return [found | {"time_s": found["time_s"] - self.since} for found in super().collisions()]
+
     def _read(self) -> None:
         """Where SUMO has the trains."""
-        n, vehicle, there = len(self.ids), libsumo.vehicle, libsumo.vehicle.getIDList()
+        n, vehicle = len(self.ids), libsumo.vehicle
+        everybody = vehicle.getIDList()
+        there = [name for name in everybody if name in self.number]
+        self.others |= {
+            name: vehicle.getVehicleClass(name) for name in everybody if name not in self.number and name not in self.others
+        }
         position, row, present = self.seen.position.copy(), self.seen.row.copy(), np.zeros(n, bool)
         self.speed: Floats = np.full(n, np.nan)
+        stops = [""] * n
         for name in there:
             i = self.number[name]
-            row[i], present[i] = self._row(i, self.line.index[vehicle.getRoadID(name)]), True
+            row[i], present[i] = self._row(i, vehicle.getRoadID(name)), True
             position[i] = self.ways.begin[row[i]] + vehicle.getLanePosition(name)
             self.speed[i] = vehicle.getSpeed(name)
+            stops[i] = _stop(name) if vehicle.isStopped(name) else ""
+        self.stops = tuple(stops)
         self.seen = Seen(position, self.ways.edge[row], row, present)
         self.ahead: Ints = np.full(n, -1)
         self.spacing: Floats = np.full(n, np.nan)
@@ -98,15 +136,31 @@ class Baseline(Session):
             for name in there:
                 self._ahead_on_way(name)
 
-    def _row(self, i: int, edge: int) -> int:
-        """The row of the edge a train is on, from where it was on its way."""
-        row, end = int(self.seen.row[i]), int(self.ways.first[i + 1])
-        if self.ways.edge[row] == edge:
-            return row
-        onward = np.flatnonzero(self.ways.edge[row:end] == edge)
-        if not len(onward):
-            raise CouplingError(f"train {self.ids[i]} left its way on edge {self.line.edges[edge]} at {self._time():.3f} s")
-        return row + int(onward[0])
+    def _row(self, i: int, edge: str) -> int:
+        """The row of the edge a train is on, from where it was on its way; SUMO may have given it another."""
+        for _ in range(2):
+            row, end = int(self.seen.row[i]), int(self.ways.first[i + 1])
+            onward = np.flatnonzero(self.ways.edge[row:end] == self.line.index.get(edge, -1))
+            if len(onward):
+                return row + int(onward[0])
+            self._take_over(i, edge)
+        raise CouplingError(f"train {self.ids[i]} left its way on edge {edge} at {self._time():.3f} s")
+
+    def _take_over(self, i: int, edge: str) -> None:
+        """The way of a train that SUMO's own rerouters, or its routing, have changed, from the edge it was on."""
+        if self.p.placed:
+            return
+        name, line, row = self.ids[i], self.line, int(self.seen.row[i])
+        route, at = libsumo.vehicle.getRoute(name), libsumo.vehicle.getRouteIndex(name)
+        was = line.edges[self.ways.edge[row]]
+        first = max(k for k in range(at + 1) if k == 0 or route[k] == was)
+        try:
+            way = self.p.rails.way(route[first:])
+        except ValueError as error:
+            raise CouplingError(f"train {name} on edge {edge} at {self._time():.3f} s: {error}") from None
+        before = self.ways.first
+        self.ways = rerouted(self.ways, i, row, way, line.start_m, line.length_m)
+        self.seen = self.seen._replace(row=self.seen.row + self.ways.first[:-1] - before[:-1])
 
     def _ahead_on_track(self) -> None:
         """Find the train ahead on the same track of a line."""
@@ -128,7 +182,7 @@ class Baseline(Session):
     def _verify_placed(self) -> None:
         """Trains that are placed stand where the scenario says, all of them."""
         wrong = []
-        for i, d in enumerate(self.departures):
+        for i, d in enumerate(self.departures):  # those of a line
             at = float(self.seen.position[i])
             if d.placed and not self.seen.present[i]:
                 wrong.append(f"train {d.id} was not inserted at {d.position_m:.3f} m of edge {d.route[0]}")
@@ -136,3 +190,11 @@ class Baseline(Session):
                 wrong.append(f"train {d.id} was inserted at {at:.6f} m on the line, not at {d.position_m:.6f} m of its edge")
         if wrong:
             raise CouplingError("; ".join(wrong))
+
+
+def _stop(name: str) -> str:
+    """What the stop is called at which a train stands: its place, else its edge; "" if it only passes a waypoint."""
+    found = libsumo.vehicle.getStops(name, 1)
+    if not found or found[0].speed > 0.0:
+        return ""
+    return str(found[0].stoppingPlaceID or libsumo.vehicle.getRoadID(name))

@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from pathlib import Path
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from sumo_net import LineError
 from sumo_net.netfile import content
 from trainctl.errors import InputError
 from trainctl.scenario.model import Model
 from trainctl.signals import SPEED, Floats
 from trainctl.sumo.session import OPTIONS, fcd_period, normal
+from trainctl.traffic.files import named_files, read_options
 
-
-class VehicleStop(NamedTuple):
-    """Where a train waits."""
-
-    edge: str
-    end_m: float  # its front, from the beginning of the edge
-    duration: float  # s
-    until: float  # s, not before; -inf if it may
-    parks: bool  # off the track
+#: Options that are ours: what is written and shown, and who listens.
+OURS = re.compile(
+    r"output|log|^save-|gui|^start$|^quit-on-end$|^remote-port$|^num-clients$|^summary$|^tripinfo$|^netstate|warnings$"
+)
 
 
 class Vehicle(NamedTuple):
@@ -37,8 +36,6 @@ class Vehicle(NamedTuple):
     top_speed: float  # m/s
     speed_factor: float  # share of a speed limit that it keeps to
     placed: bool  # whatever SUMO thinks of it
-    stops: tuple[VehicleStop, ...]
-    arrival_m: float = np.inf  # where on the last edge it leaves; inf: at its end
 
 
 def verify_signals(p: Model) -> None:
@@ -49,21 +46,19 @@ def verify_signals(p: Model) -> None:
     InputError
         It has none.
     """
-    if p.net is not None and p.params.block == "fixed" and b'type="rail_signal"' not in content(p.net):
+    if p.net is not None and block(p) == "fixed" and b'type="rail_signal"' not in content(p.net):
         rule = 'has no rail signals; give it some, or take block = "moving"'
         raise InputError(f"{p.file}: controller.block = fixed: {p.net.name} {rule}")
 
 
 def departures(p: Model) -> list[Vehicle]:
-    """The trains of a scenario, one each.
+    """The trains of a line, one each.
 
     Raises
     ------
     InputError
         They cannot enter where ``entry_m`` says.
     """
-    if not p.placed:
-        return _coming(p)
     line, entry = p.line, p.params.entry_m
     if entry is not None and not line.begin_m <= entry < line.end_m:
         raise InputError(f"{p.file}: controller.entry_m = {entry:.10g}: off the line, {line.begin_m:.10g} .. {line.end_m:.10g} m")
@@ -73,7 +68,7 @@ def departures(p: Model) -> list[Vehicle]:
         found.append(Vehicle(
             id=t.id, vclass="rail", route=tuple(line.route(t.track, position)), position_m=float(line.locate(t.track, position)[1]),
             depart=k * p.params.entry_every_s, speed=float(t.speed_mps) if entry is None else p.params.entry_speed_mps,
-            top_speed=top, speed_factor=1.0, placed=entry is None, stops=(),
+            top_speed=top, speed_factor=1.0, placed=entry is None,
         ))  # fmt: skip
     return found
 
@@ -85,29 +80,6 @@ def _top_speeds(p: Model) -> Floats:
     instants = np.arange(p.scenario.run.steps + 1) * p.scenario.run.step_s
     wanted = max(p.leader(float(t))[SPEED] for t in instants)
     return np.where(np.isfinite(p.bounds.speed_upper), p.bounds.speed_upper, wanted)
-
-
-def _coming(p: Model) -> list[Vehicle]:
-    """The trains of a SUMO configuration, as its files have them."""
-    roster, rails = p.roster, p.rails
-    found = []
-    for i, name in enumerate(p.scenario.ids):
-        way = [rails.index[e] for e in roster.routes[i]]
-        begin = rails.start_m[way[0]] + np.concatenate([[0.0], np.cumsum(rails.length_m[way])])
-        stops = []
-        for stop in roster.stops[i]:
-            row = int(np.searchsorted(begin, stop.place, side="left")) - 1
-            stops.append(VehicleStop(rails.edges[way[row]], float(stop.place - begin[row]), stop.duration, stop.until, stop.parks))
-        # Whoever would start faster than it may is refused by SUMO, in the middle of the run.
-        speed = min(float(roster.speed[i]), float(roster.speed_factor[i] * rails.speed_mps[way[0]]))
-        top = p.params.top_speed_mps
-        found.append(Vehicle(
-            id=name, vclass=roster.vclass[i], route=roster.routes[i], position_m=float(roster.lane_position[i]),
-            depart=float(roster.depart[i]), speed=None if np.isnan(speed) else speed,
-            top_speed=float(roster.top_speed[i]) if top is None else min(top, float(roster.top_speed[i])),
-            speed_factor=float(roster.speed_factor[i]), placed=False, stops=tuple(stops), arrival_m=float(roster.arrival[i]),
-        ))  # fmt: skip
-    return found
 
 
 def write_routes(p: Model, trains: list[Vehicle], path: Path) -> None:
@@ -125,20 +97,8 @@ def write_routes(p: Model, trains: list[Vehicle], path: Path) -> None:
         given = {
             "id": d.id, "type": kinds[key], "depart": f"{d.depart:.3f}", "departLane": "best", "departPos": repr(d.position_m),
             "departSpeed": None if d.speed is None else repr(d.speed), "insertionChecks": "none" if d.placed else None,
-            "arrivalPos": None if np.isinf(d.arrival_m) else repr(d.arrival_m),
         }  # fmt: skip
-        lines.append(f'    <vehicle{_words(given)}><route edges="{" ".join(normal(d.route))}"/>')
-        for stop in d.stops:
-            until = None if np.isinf(stop.until) else f"{stop.until:.3f}"
-            said = {
-                "lane": f"{stop.edge}_0",
-                "endPos": repr(stop.end_m),
-                "duration": f"{stop.duration:.3f}",
-                "until": until,
-                "parking": "true" if stop.parks else None,
-            }
-            lines.append(f"        <stop{_words(said)}/>")
-        lines.append("    </vehicle>")
+        lines.append(f'    <vehicle{_words(given)}><route edges="{" ".join(normal(d.route))}"/></vehicle>')
     path.write_text("\n".join([*lines, "</routes>", ""]), encoding="utf-8")
 
 
@@ -154,8 +114,64 @@ def write_configuration(p: Model, net: str, folder: Path) -> Path:
         **{key: value for key, value in OPTIONS.items() if key != "insertion-checks"},
         **({"collision.check-junctions": "true"} if internal else {"no-internal-links": "true"}),
         **fcd_period(p.scenario.run.record_every_s),
-        **({"railsignal-moving-block": "true"} if p.params.block == "moving" else {}),
+        **({"railsignal-moving-block": "true"} if block(p) == "moving" else {}),
     }  # fmt: skip
+    return _written(options, folder)
+
+
+def write_own_configuration(p: Model, net: str, folder: Path) -> Path:
+    """``run.sumocfg`` of a SUMO configuration as its files have it, but for outputs, and for what ``block`` says.
+
+    Route and additional files are copied beside it, so that what they write comes to lie there; those that name others stay where
+    they are.
+
+    Raises
+    ------
+    InputError
+        The configuration, or a file that it names, is not there any more.
+    """
+    source = Path(p.roster.source)
+    said = read_options(source)
+    kept = {key: value for key, value in said.items() if not OURS.search(key)}
+    if "load-state" in kept:
+        kept["load-state"] = str((source.parent / kept["load-state"]).resolve())
+    for key in ("route-files", "additional-files"):
+        files = [_beside(path, folder, f"{key[:5]}{k}") for k, path in enumerate(named_files(source, said, key))]
+        kept |= {key: ",".join(files)} if files else {}
+    logs = (
+        "no-step-log",
+        "fcd-output.distance",
+        "tripinfo-output.write-unfinished",
+        "vehroute-output.write-unfinished",
+        "precision",
+    )
+    options = {
+        **kept, "net-file": net, "step-length": f"{p.scenario.run.step_s:g}",
+        **{key: OPTIONS[key] for key in (*logs, "time-to-teleport", "collision.action")},
+        **fcd_period(p.scenario.run.record_every_s),
+        **({} if block(p) == "files" else {"railsignal-moving-block": str(block(p) == "moving").lower()}),
+    }  # fmt: skip
+    options.pop("end", None)
+    return _written(options, folder)
+
+
+def _beside(path: Path, folder: Path, name: str) -> str:
+    """What a file is called in ``folder``: a copy, or where it is if it names other files."""
+    try:
+        if re.search(rb"<include |<(variableSpeedSign|rerouter|calibrator)[^>]* file=", content(path)):
+            return str(path.resolve())
+        shutil.copyfile(path, folder / f"{name}_{path.name}")
+    except (LineError, OSError) as error:
+        raise InputError(f"{path}: {error}") from None
+    return f"{name}_{path.name}"
+
+
+def block(p: Model) -> str:
+    """How SUMO keeps its trains apart."""
+    return str(p.params.block or ("fixed" if p.placed else "files"))
+
+
+def _written(options: dict[str, str], folder: Path) -> Path:
     path = folder / "run.sumocfg"
     body = "".join(f"    <{key} value={quoteattr(value)}/>\n" for key, value in options.items())
     path.write_text(f"<configuration>\n{body}</configuration>\n", encoding="utf-8")

@@ -11,7 +11,7 @@ import os
 import re
 import sys
 from collections import deque
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -26,10 +26,8 @@ from trainctl.numeric import LEAVES_M, lay_out, way_lengths
 from trainctl.railway.ways import Ways, rerouted
 from trainctl.runs.sumo_logs import elements
 from trainctl.signals import Bools, Floats, Ints, Links, Seen, Start
+from trainctl.sumo.causes import SPEED_MODE_FREE, cause
 from trainctl.sumo.preflight import objections
-
-#: Speed mode 32 switches off every speed correction of SUMO's; each inserted train starts with all of them on (31).
-SPEED_MODE_FREE = 32
 
 #: What SUMO adds in one step is exact to rounding; anything beyond was somebody else.
 TOLERANCE_M = 1e-6
@@ -174,6 +172,7 @@ class Session:
     """
 
     api: Any = libsumo
+    logs: Mapping[str, str] = LOGS
     ids: Sequence[str]
     ways: Ways
     seen: Seen
@@ -194,7 +193,7 @@ class Session:
 
     def _begin(self, configuration: Path) -> None:
         """Start SUMO, which then has its first trains on the net."""
-        logs = [part for key, name in LOGS.items() for part in (f"--{key}", str(self.folder / name))]
+        logs = [part for key, name in self.logs.items() for part in (f"--{key}", str(self.folder / name))]
         self._call(self._launch, ["-c", str(configuration), *logs])
         self.began = True
         self._call(self.api.simulationStep)
@@ -211,7 +210,7 @@ class Session:
         if self.began:
             self.began = False
             self.api.close()
-            torn = [name for key, name in LOGS.items() if key != "log" and not _ended(self.folder / name)]
+            torn = [name for key, name in self.logs.items() if key != "log" and not _ended(self.folder / name)]
             if torn:
                 raise SimulatorError(f"SUMO left {', '.join(torn)} incomplete without a word: is the disk full?")
 
@@ -312,8 +311,10 @@ class Sumo(Session):
                 ahead = np.flatnonzero(self.ways.edge[row:end] == edge)
                 found[k] = row + ahead[0]
             except (self.api.TraCIException, KeyError, IndexError) as error:
-                why = f"{error}; did it reach the line's end?" if not isinstance(error, IndexError) else "it left its way"
-                raise CouplingError(f"train {self.ids[i]} is not on the line at {self._time():.3f} s: {why}") from None
+                why = "it left its way" if isinstance(error, IndexError) else str(error)
+                raise CouplingError(
+                    f"train {self.ids[i]} is not on its way at {self._time():.3f} s: {why} (likely cause: {self._cause(i)})"
+                ) from None
         return found
 
     def _read(self, wanted: Floats, left: Floats, present: Bools) -> Seen:
@@ -418,19 +419,16 @@ class Sumo(Session):
     def _explain(self, i: int, now: Seen, before: Floats, displacement: Floats) -> str:
         name, edge = self.ids[i], self.line.edges[now.edge[i]]
         moved = now.position[i] - before[i]
-        cause = "unknown"
-        if self.api.vehicle.getSpeedMode(name) != SPEED_MODE_FREE:
-            cause = f"its speed mode is {self.api.vehicle.getSpeedMode(name)}, not {SPEED_MODE_FREE}: SUMO corrects its speed"
-        elif name in self.api.simulation.getStartingTeleportIDList() or name in self.api.simulation.getEndingTeleportIDList():
-            cause = "a teleport"
-        elif self.api.vehicle.isStopped(name):
-            cause = "a stop"
-        elif moved < 1e-9:
-            cause = "it was held"
         return (
             f"train {name} on {edge} at {self._time():.3f} s moved {moved:.6f} m, commanded {displacement[i]:.6f} m:"
-            f" something else moved it (likely cause: {cause})"
+            f" something else moved it (likely cause: {self._cause(i)})"
         )
+
+    def _cause(self, i: int) -> str:
+        """Why SUMO did something else with a train than it was told to."""
+        row, line = int(self.seen.row[i]), self.line
+        edges = [line.edges[e] for e in self.ways.edge[row : self.ways.first[i + 1]].tolist()]
+        return cause(self.api, self.ids[i], edges[0], normal(edges))
 
 
 def _direct(function: Any) -> Any:

@@ -27,14 +27,20 @@ def rail_trains(elements: Elements, kinds: dict[str, Kind]) -> tuple[list[Elemen
     counts = Counter(PEOPLE[e.tag] for e in elements.others if e.tag in PEOPLE)
     notes = [f"{n} definitions of {word} left out" for word, n in counts.items() if n]
     notes += [f"{others} vehicles, trips and flows left out: not rail"] if others else []
-    places = {t.get("departPos", "") for t in trains} & {"random", "free", "random_free", "last", "splitFront"}
+    if late := [train.get("id", "") for train in elements.late]:
+        some = f"{', '.join(late[:8])}{' ...' if len(late) > 8 else ''}"
+        notes.append(f"{len(late)} vehicles, trips and flows left out, as in SUMO: a route file goes by departure times: {some}")
+    places = {t.get("departPos", "") for t in trains} & {"last", "splitFront"}
     notes += [
         f'departPos="{p}": the train begins with its rear at the beginning of the edge, as with "base"' for p in sorted(places)
     ]
-    if any(t.get("departSpeed") == "random" for t in trains):
-        notes.append('departSpeed="random": as fast as allowed')
-    if any(t.get("arrivalPos") == "random" for t in trains):
-        notes.append('arrivalPos="random": at the end of the edge')
+    random = [
+        f'{n} x {key}="{word}"'
+        for key in ("departEdge", "departPos", "departSpeed", "arrivalEdge", "arrivalPos")
+        for word in ("random", "free", "random_free")
+        if (n := sum(t.get(key) == word for t in trains))
+    ]
+    notes += [f"{', '.join(random)}: drawn here, with other numbers than SUMO's"] if random else []
     drawn = {t.get("type", "") for t in trains}
     drawn |= {member for name in drawn & set(elements.mixes) for member in types_of(elements.mixes[name])}
     for name in sorted(drawn & set(kinds)):
@@ -55,7 +61,7 @@ def not_followed(
     stops = {place for t in (*trains, *given) for s in t.iter("stop") for tag in PLACES for place in (s.get(tag),) if place}
     places = [e for name, e in elements.places.items() if name in stops]
     notes, refused = known.of_trains([*trains, *given, *types, *places])
-    return [*known.of_options(options), *notes, *known.of_others(elements.others), *known.of_net(net)], refused
+    return [*known.of_options(options), *notes, *known.of_others(elements.others, elements.unread), *known.of_net(net)], refused
 
 
 def refuse(sumocfg: Path, net: Path, trains: list[Element], elements: Elements, kinds: dict[str, Kind], tracks: Tracks) -> None:

@@ -21,6 +21,8 @@ _OPTIONS = {
     "n": "net-file", "net": "net-file", "r": "route-files", "routes": "route-files", "a": "additional-files",
     "additional": "additional-files", "b": "begin", "e": "end",
 }  # fmt: skip
+#: What SUMO passes over in a route file.
+ADDITIONAL = frozenset(("variableSpeedSign", "rerouter", "calibrator"))
 _TRAINS = ("vehicle", "trip", "flow")
 #: Who else travels: only counted.
 PEOPLE = {"person": "persons", "personFlow": "persons", "container": "containers", "containerFlow": "containers"}
@@ -36,6 +38,8 @@ class Elements(NamedTuple):
     trains: list[Element]
     places: dict[str, Element]
     others: list[Element]  # persons, rerouters and whatever else there is
+    unread: list[Element]  # what SUMO reads in additional files alone, in a route file
+    late: list[Element]  # trains behind later ones in a route file, which SUMO passes over
 
 
 def parse(path: Path) -> Element:
@@ -68,16 +72,20 @@ def named_files(sumocfg: Path, options: dict[str, str], key: str) -> list[Path]:
     return [sumocfg.parent / name.strip() for name in re.split(r"[,;]", options.get(key, "")) if name.strip()]
 
 
-def read_demand(files: list[Path]) -> Elements:
-    """What route files and additional files say, with the files they include; a name may be given once."""
-    d = Elements({}, {}, {}, {}, [], {}, [])
+def read_demand(additional: list[Path], routes: list[Path]) -> Elements:
+    """What additional files and route files say, with the files they include; a name may be given once."""
+    d = Elements({}, {}, {}, {}, [], {}, [], [], [])
     named = {"vType": d.types, "vTypeDistribution": d.mixes, "route": d.routes, "routeDistribution": d.drawn}
     wrong = []
-    for path in files:
+    for path in (*additional, *routes):
+        last = -math.inf
         for element in _elements(path):
             tag = element.tag
             if tag in _TRAINS:
-                d.trains.append(element)
+                depart = element.get("begin" if tag == "flow" else "depart", "0")
+                begins = seconds(depart) if is_time(depart) else last  # what is no time is told later
+                (d.late if begins < last and path not in additional else d.trains).append(element)
+                last = max(last, begins)
             elif tag in named or tag in PLACES:
                 # The members of a distribution have a name of their own.
                 members = [e for e in element if tag in ("vTypeDistribution", "routeDistribution") and not e.get("refId")]
@@ -88,6 +96,8 @@ def read_demand(files: list[Path]) -> Elements:
                         table[name] = e
                     elif e is element:
                         wrong.append(f"{path}: a {tag} has no id")
+            elif tag in ADDITIONAL and path not in additional:
+                d.unread.append(element)
             else:
                 d.others.append(element)
     if wrong:
@@ -100,6 +110,8 @@ def _elements(path: Path, within: tuple[Path, ...] = ()) -> Iterator[Element]:
     if path.resolve() in within:
         raise InputError(f"{path}: includes itself")
     for element in parse(path):
+        if element.tag in ("variableSpeedSign", "rerouter") and element.get("file"):
+            element.set("file", str(path.parent / element.get("file", "")))
         if element.tag == "include":
             yield from _elements(path.parent / element.get("href", ""), (*within, path.resolve()))
         else:

@@ -92,8 +92,8 @@ ELEMENTS: Mapping[str, frozenset[str]] = {
     "routeDistribution": _words("id routes probabilities last"),
     "vTypeDistribution": _words("id vTypes probabilities"),
     "stop": _words(
-        "lane edge startPos endPos friendlyPos duration until ended trainStop busStop containerStop parkingArea chargingStation",
-        "overheadWireSegment speed",
+        "lane edge startPos endPos friendlyPos duration until arrival ended trainStop busStop containerStop parkingArea",
+        "chargingStation overheadWireSegment speed",
     ),
     "vType": _words(
         "id vClass length maxSpeed speedFactor probability carFollowModel trainType mass maxPower maxTraction resCoef_constant",
@@ -115,7 +115,7 @@ OF_NO_EFFECT: Mapping[str, frozenset[str]] = {
     "flow": _drawn,
     "route": _words("color cost period savings exitTimes type"),
     "stop": _words(
-        "line tripId actType color name arrival posLat permitted expected expectedContainers",
+        "line tripId actType color name posLat permitted expected expectedContainers",
     ),
     "vType": _words(
         "color width height guiShape imgFile osgFile emissionClass carriageLength locomotiveLength carriageGap personCapacity",
@@ -156,7 +156,7 @@ NAMED: Mapping[tuple[str, str], tuple[str, frozenset[str]] | Refused] = {
     ("stop", "onDemand"): ("nobody waits or boards; the train stops", OFF),
     ("stop", "index"): ("stops are made in the order of the file", _words("end fit")),
     ("stop", "extension"): ("nobody is waited for", OFF),
-    ("parkingArea", "roadsideCapacity"): ("there is room for everybody", frozenset()),
+    ("parkingArea", "roadsideCapacity"): ("trains park at its end, whichever place is free", _words("0 1")),
     ("parkingArea", "onRoad"): ("who stops there leaves the track", OFF),
     ("vType", "scale"): ("every train of it comes once", _words("1 1.0 1.00")),
     **{
@@ -168,8 +168,6 @@ NAMED: Mapping[tuple[str, str], tuple[str, frozenset[str]] | Refused] = {
 
 #: Whole elements of route and additional files that are not followed, in which words.
 ELEMENTS_NAMED: Mapping[str, str | Refused] = {
-    "rerouter": "trains keep their routes",
-    "variableSpeedSign": "the speed limits of the net hold all the time",
     "calibrator": "no train is let in or taken out by it",
     "railSignalConstraints": "trains go first come, first served",
     "tlLogic": "signals are not obeyed; our own interlocking keeps trains apart",
@@ -183,8 +181,10 @@ ELEMENTS_NAMED: Mapping[str, str | Refused] = {
     "interval": "flows between edges or zones have no route here",
     "relation": "they say nothing of a train here",
     "deadlock": "our own interlocking keeps trains apart",
-    "closeLane": "no lane is closed", "closingReroute": "no edge is closed", "closingLaneReroute": "no lane is closed",
 }  # fmt: skip
+
+#: Whole elements of additional files that are followed.
+ELEMENTS_FOLLOWED = _words("variableSpeedSign rerouter")
 
 #: Elements that cannot change the run of a train: outputs, drawings, and what belongs to roads.
 ELEMENTS_OF_NO_EFFECT = _words(
@@ -240,7 +240,7 @@ def _of_one(element: Element) -> Iterator[tuple[str, str | Refused]]:
     tag = element.tag
     if tag == "param" or tag.startswith("carFollowing-"):
         return
-    if tag not in ELEMENTS:
+    if tag not in ELEMENTS and tag != "space":
         yield tag, UNKNOWN
         return
     for key, value in element.items():
@@ -253,13 +253,19 @@ def _of_one(element: Element) -> Iterator[tuple[str, str | Refused]]:
             yield f"{tag} {key}", said[0]
 
 
-def of_others(elements: Iterable[Element]) -> list[str]:
-    """What elements beside trains, routes, stops and types are not followed, one line for each kind."""
-    counts = Counter(e.tag for e in elements if e.tag not in ELEMENTS and e.tag not in ELEMENTS_OF_NO_EFFECT)
+def of_others(elements: Iterable[Element], unread: Iterable[Element]) -> list[str]:
+    """What elements beside trains, routes, stops and types are not followed, one line for each kind.
+
+    ``unread`` are those in route files that SUMO reads in additional files alone.
+    """
+    passed = ELEMENTS.keys() | ELEMENTS_FOLLOWED | ELEMENTS_OF_NO_EFFECT
+    counts = Counter(e.tag for e in elements if e.tag not in passed)
     lines = []
     for tag, n in counts.items():
         words = ELEMENTS_NAMED.get(tag, UNKNOWN)
         lines.append(f"{n} x <{tag}>: not followed: {words}")
+    for tag, n in Counter(e.tag for e in unread).items():
+        lines.append(f"{n} x <{tag}> in route files: not followed, as in SUMO, which reads it in additional files alone")
     return lines
 
 

@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element
 from sumo_net.netfile import NetFile, for_trains, read_net
 from sumo_net.spec import LineError
 from trainctl.errors import InputError
-from trainctl.traffic.files import PLACES, Elements, bad_number, bad_time, is_time, seconds
+from trainctl.traffic.files import PLACES, Elements, bad_number, bad_time, is_number, is_time, seconds
 
 #: What is said of a road net.
 NO_RAIL = "has no rail edges: none of its lanes allows a rail class by name, and no route runs over one that lets everybody on"
@@ -25,6 +25,7 @@ class Tracks(NamedTuple):
     """What a net says of connections."""
 
     length: dict[str, float]  # of lanes [m]
+    speed: dict[str, float]  # limit of edges, on the lane that trains take [m/s]
     onward: dict[str, set[str]]  # from each edge
     file: NetFile
     marked: bool  # it has lanes that allow a rail class by name
@@ -38,6 +39,20 @@ class Place(NamedTuple):
     wrong: str  # why it cannot stop there, or ""
 
 
+class Area(NamedTuple):
+    """A parking area."""
+
+    lots: int  # how many trains find a place
+    depth_m: float  # who finds none waits this far before
+
+
+def area_of(element: Element, place: Place) -> Area:
+    """Of a parking area with its end at ``place``: whose capacity is not said has none beside the spaces it lists, as in SUMO."""
+    said, start = element.get("roadsideCapacity", "0"), element.get("startPos", "0")
+    lots = (int(said) if said.isdecimal() else 0) + len(list(element.iter("space")))
+    return Area(lots, max(place.position_m - (float(start) if is_number(start) else 0.0), 0.0))
+
+
 def read_tracks(net: Path) -> Tracks:
     """Lanes and connections of a net with rail edges."""
     try:
@@ -47,6 +62,12 @@ def read_tracks(net: Path) -> Tracks:
     normal = [e for e in file.edges if e.attributes.get("function", "normal") == "normal"]
     if not any(for_trains(lane, anybody=True) for edge in normal for lane in edge.lanes):
         raise InputError(f"{net}: {NO_RAIL}")
+    speed = {
+        edge.attributes.get("id", ""): float(lane["speed"])
+        for edge in normal
+        for lane in [lane for lane in edge.lanes if for_trains(lane, anybody=True)][:1]
+        if is_number(lane.get("speed", ""))
+    }
     onward: dict[str, set[str]] = {edge.attributes.get("id", ""): set() for edge in file.edges}
     try:
         length = {lane["id"]: float(lane["length"]) for edge in file.edges for lane in edge.lanes}
@@ -54,7 +75,7 @@ def read_tracks(net: Path) -> Tracks:
             onward.setdefault(c["from"], set()).add(c["to"])
     except (KeyError, ValueError) as error:
         raise InputError(f"{net}: not a SUMO net: a lane or a connection has no {error}") from None
-    return Tracks(length, onward, file, any(for_trains(lane) for edge in normal for lane in edge.lanes))
+    return Tracks(length, speed, onward, file, any(for_trains(lane) for edge in normal for lane in edge.lanes))
 
 
 def unmarked(edges: Iterable[str], tracks: Tracks) -> list[str]:
@@ -84,6 +105,8 @@ def place_of(stop: Element, elements: Elements, tracks: Tracks) -> Place:
     # A duration below 0 is none.
     said_wrong = [] if is_time(stop.get("duration", "0")) else [f"duration = {stop.get('duration')}"]
     said_wrong += [f"until = {stop.get('until')}"] if bad_time(stop.get("until", "0")) else []
+    arrival = stop.get("arrival", "0")
+    said_wrong += [] if is_time(arrival) else [f"arrival = {arrival}"]
     said_wrong += [f"speed = {stop.get('speed')}"] if bad_number(stop.get("speed")) else []
     try:
         position = float(where.get("endPos", length))

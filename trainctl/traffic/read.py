@@ -11,10 +11,14 @@ from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
+import numpy as np
+
 from sumo_net.netfile import RAIL
+from trainctl import draws
 from trainctl.errors import InputError
 from trainctl.traffic import crossings
 from trainctl.traffic.checks import not_followed, rail_trains, refuse
+from trainctl.traffic.closings import Closing, closings
 from trainctl.traffic.duarouter import expand
 from trainctl.traffic.files import (
     PLACES,
@@ -29,8 +33,9 @@ from trainctl.traffic.files import (
     seconds,
 )
 from trainctl.traffic.kinds import Kind, default_types, kind_of
-from trainctl.traffic.places import YES, Tracks, off_route, place_of, read_tracks, unconnected, unmarked
+from trainctl.traffic.places import YES, Area, Place, Tracks, area_of, off_route, place_of, read_tracks, unconnected, unmarked
 from trainctl.traffic.scale import scaled
+from trainctl.traffic.speed_signs import Change, speed_signs
 from trainctl.traffic.trial import in_doubt, tried
 
 #: What SUMO takes in place of a number; the first is its default.
@@ -40,6 +45,8 @@ _WORDS = {
     "arrivalPos": ("max", "random", "center"),
 }
 
+#: What may be drawn of a train, each by its number here.
+_DRAWN = ("departEdge", "arrivalEdge", "departPos", "departSpeed", "arrivalPos")
 
 #: How fast a train begins of which nothing is said: SUMO's own default since 1.27.
 DEPART_SPEED = "avg"
@@ -56,6 +63,8 @@ class StopElement(NamedTuple):
     first: int  # number in the route of the earliest edge it may be on
     pass_mps: float  # it does not stand, but passes with at most this speed; 0: it stands
     parks: bool  # it leaves the track meanwhile
+    area: Area | None  # where others park too
+    arrival_s: float | None  # planned
 
 
 class Departure(NamedTuple):
@@ -84,6 +93,9 @@ class Configuration(NamedTuple):
     step_s: float
     patience_s: float  # after this time trains that could not enter do not come any more; inf: they always do
     notes: tuple[str, ...]  # what is not followed
+    signs: tuple[Change, ...]  # variable speed signs
+    closings: tuple[Closing, ...]
+    drawn: tuple[str, ...]  # flows whose departures are drawn
 
 
 def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, seed: int = 42) -> Configuration:
@@ -129,7 +141,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
     begin, own_end = times["begin"], times["end"] if times["end"] >= 0 else None
     ends = [e for e in (own_end, None if duration_s is None else begin + duration_s) if e is not None]
     tracks = read_tracks(net[0])
-    elements = read_demand([*more, *routes])
+    elements = read_demand(more, routes)
     if options.get("use-stop-ended", "false").lower() in YES:
         _ended(elements)
     wrong = [
@@ -145,9 +157,15 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
     more_notes, refused = not_followed(options, trains, elements, kinds, tracks.file)
     if refused:
         raise InputError([f"{sumocfg}: {line}" for line in refused])
+    signs, wrong = speed_signs(elements.others, tracks)
+    closed, rerouter_notes, mistakes = closings(elements.others, tracks, {k.vclass for k in kinds.values()})
+    more_notes += rerouter_notes
+    wrong += mistakes
+    if wrong:
+        raise InputError([f"{sumocfg}: {line}" for line in wrong])
     refuse(sumocfg, net[0], trains, elements, kinds, tracks)
     if float(scale) != 1.0:
-        trains, scale_notes = scaled(trains, float(scale), options.get("scale-suffix", "."))
+        trains, scale_notes = scaled(trains, elements.trains, float(scale), options.get("scale-suffix", "."))
         notes += scale_notes
     if in_doubt(net[0], tracks.file):
         tried(net[0])
@@ -167,7 +185,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         kind = kinds[vehicle.get("type", "DEFAULT_VEHTYPE")]
         if kind.vclass not in RAIL:
             continue
-        train, mistakes = _departure(vehicle, source, kind, elements, tracks, speed)
+        train, mistakes = _departure(vehicle, source, kind, elements, tracks, speed, seed)
         departures.append((order[source.get("id", "")], train))
         wrong += mistakes
     if wrong:
@@ -191,6 +209,9 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         step_s=times["step-length"],
         patience_s=seconds(patience) if seconds(patience) >= 0 else math.inf,
         notes=(*notes, *more_notes),
+        signs=tuple(signs),
+        closings=tuple(closed),
+        drawn=tuple(t.get("id", "") for t in trains if "probability" in t.attrib or t.get("period", "").startswith("exp")),
     )
 
 
@@ -228,13 +249,20 @@ def _lap(edges: tuple[str, ...], routes: list[Element]) -> tuple[tuple[str, ...]
     return edges, 1, 0
 
 
-def _cut(source: Element, edges: tuple[str, ...], laps: int) -> tuple[int, int] | str:
+def _drawn(seed: int, train: str, key: str) -> float:
+    """A number in [0, 1) for what a train has at random."""
+    return float(draws.uniform(seed, draws.DEPARTURE, np.array([_DRAWN.index(key)]), np.array([[draws.word(train), 0]]))[0, 0])
+
+
+def _cut(source: Element, edges: tuple[str, ...], laps: int, seed: int, train: str) -> tuple[int, int] | str:
     """Numbers of the first edge of a route that a train runs over and of the one behind the last; else what is wrong."""
-    found = []
+    found: list[int] = []
     for key, missing in (("departEdge", 0), ("arrivalEdge", len(edges) * laps - 1)):
         said = source.get(key, str(missing))
         if said in ("random", "free"):
-            return f"{key} = {said}: is drawn by SUMO; give the number of an edge"
+            lowest = found[0] if found else 0
+            found.append(lowest + int(_drawn(seed, train, key) * (len(edges) * laps - lowest)))
+            continue
         if not said.isdecimal() or int(said) >= len(edges) * laps:
             return f"{key} = {said}: must be the number of an edge of its route, 0 to {len(edges) * laps - 1}"
         found.append(int(said))
@@ -243,19 +271,24 @@ def _cut(source: Element, edges: tuple[str, ...], laps: int) -> tuple[int, int] 
 
 
 def _departure(
-    vehicle: Element, source: Element, kind: Kind, elements: Elements, tracks: Tracks, default_speed: str
+    vehicle: Element, source: Element, kind: Kind, elements: Elements, tracks: Tracks, default_speed: str, seed: int
 ) -> tuple[Departure, list[str]]:
     """A train out of what duarouter wrote and what the file said, and the mistakes in it."""
     name, route = vehicle.get("id", ""), vehicle.find("route")
     edges = () if route is None else tuple(route.get("edges", "").split())
     edges, laps, of_lap = _lap(edges, routes_of(source, elements))
-    cut = _cut(source, edges, laps)
+    cut = _cut(source, edges, laps, seed, name)
     first, end = (0, len(edges) * laps) if isinstance(cut, str) else cut
     firsts = [max(k // of_lap * len(edges) - first, 0) if k < laps * of_lap else 0 for k, _ in enumerate(vehicle.iter("stop"))]
     edges = (edges * laps)[first:end]
-    places = [place_of(stop, elements, tracks) for stop in vehicle.iter("stop")]
+    given = list(vehicle.iter("stop"))
+    places = [place_of(stop, elements, tracks) for stop in given]
+    # duarouter counts ``until`` at stops of a named route from the departure, as SUMO does, but not ``arrival``.
+    late = float(vehicle.get("depart", "0")) if source.get("route") else 0.0
+    planned = [_planned(stop, late if k < of_lap else 0.0 if k >= laps * of_lap else None) for k, stop in enumerate(given)]
     wrong = [f"train {name}: {m}" for m in (*unconnected(list(edges), tracks), *off_route(edges, places, firsts))]
     wrong += [f"train {name}: {cut}"] if isinstance(cut, str) else []
+    wrong += [f"train {name}: {m}" for m in (_backwards(given, planned, places) if laps == 1 else [])]
     stops = [
         StopElement(
             edge=place.lane.rpartition("_")[0],
@@ -266,8 +299,10 @@ def _departure(
             first=at,
             pass_mps=float(stop.get("speed", "0")),
             parks=stop.get("parking", "false").lower() in YES or stop.get("parkingArea") is not None,
+            area=area_of(elements.places[stop.get("parkingArea", "")], place) if stop.get("parkingArea") else None,
+            arrival_s=arrival,
         )
-        for stop, place, at in zip(vehicle.iter("stop"), places, firsts, strict=True)
+        for stop, place, at, arrival in zip(given, places, firsts, planned, strict=True)
     ]
     departure = Departure(
         id=name,
@@ -293,19 +328,46 @@ def _departure(
         wrong.append(f"train {name}: departSpeed = {source.get('departSpeed')}: must not be negative")
     if wrong:
         return departure, wrong
-    position = _depart_position(source.get("departPos", "base"), kind.length_m, begun, departure)
+    said = source.get("departPos", "base")
+    position = _depart_position(said, kind.length_m, begun, departure)
+    if said in ("random", "free", "random_free"):
+        position = min(_drawn(seed, name, "departPos") * begun, position if stops and stops[0].edge == edges[0] else begun)
     arrival = source.get("arrivalPos", "max")
-    arrival_m = ended / 2 if arrival == "center" else None
+    arrival_m = {"center": ended / 2, "random": _drawn(seed, name, "arrivalPos") * ended}.get(arrival)
     if is_number(arrival):
         arrival_m = min(max(float(arrival) + (ended if float(arrival) < 0 else 0.0), 0.0), ended)  # as in SUMO
     speed = source.get("departSpeed", default_speed)
     speed_mps = float(speed) if is_number(speed) else None
+    if speed == "random":
+        speed_mps = _drawn(seed, name, "departSpeed") * min(kind.max_speed_mps, kind.speed_factor * tracks.speed[edges[0]])
     if not 0.0 <= position <= begun:
         wrong.append(f"train {name}: departPos = {source.get('departPos')}: off edge {edges[0]}, which is {begun:g} m long")
     if stops and stops[0].edge == edges[0] and position >= stops[0].position_m:
         speed_mps = 0.0
     like = speed if speed in ("avg", "last") else ""
     return departure._replace(position_m=position, arrival_m=arrival_m, speed_mps=speed_mps, like=like), wrong
+
+
+def _planned(stop: Element, late: float | None) -> float | None:
+    """Planned arrival at a stop [s], ``late`` more than its file says; None if it has none, or none in this lap."""
+    said = stop.get("arrival")
+    return seconds(said) + late if said is not None and late is not None and is_time(said) and seconds(said) >= 0 else None
+
+
+def _backwards(stops: list[Element], arrivals: list[float | None], places: list[Place]) -> list[str]:
+    """Mistakes in a timetable: planned times that lie before an earlier one on the way."""
+    wrong, last = [], 0.0
+    for stop, arrival, place in zip(stops, arrivals, places, strict=True):
+        said = stop.get("until", "-1")
+        until = seconds(said) if is_time(said) else -1.0
+        for key, planned in (("arrival", arrival), ("until", until if until >= 0 else None)):
+            if planned is not None and planned < last:
+                edge = place.lane.rpartition("_")[0]
+                wrong.append(
+                    f"stop on edge {edge}: {key} = {planned:g} s: must not be before {last:g} s, planned earlier on its way"
+                )
+            last = max(last, planned or 0.0)
+    return wrong
 
 
 def _depart_position(said: str, length: float, first: float, departure: Departure) -> float:

@@ -10,31 +10,42 @@ from xml.etree.ElementTree import Element
 from trainctl.traffic.files import is_number, seconds
 
 
-def scaled(trains: list[Element], scale: float, suffix: str) -> tuple[list[Element], list[str]]:
+def scaled(trains: list[Element], everybody: list[Element], scale: float, suffix: str) -> tuple[list[Element], list[str]]:
     """Trains, trips and flows times ``scale``, and what of it is not followed.
 
-    A flow has its trains in shorter intervals. A train comes as often as the whole number below says, its copies named
-    ``suffix`` and their number; whether it comes once more SUMO draws, and nobody else can tell.
+    A flow has its trains in shorter intervals. A train comes as often as ``often`` says, its copies named ``suffix`` and their
+    number; ``everybody`` are all vehicles in the order of the files, the trains among them.
     """
-    found, copies = [], int(scale)
+    found, loaded, single = [], 0, {id(train): 0 for train in trains if train.tag != "flow"}
+    for before, vehicle in enumerate(v for v in everybody if v.tag != "flow"):
+        loaded += 1
+        times = often(scale, int(loaded / scale) if scale > 1.0 else before)
+        loaded += times - 1 if scale > 1.0 else 0
+        if id(vehicle) in single:
+            single[id(vehicle)] = times
     for train in trains:
         if train.tag == "flow":
             found.append(_flow(train, scale))
             continue
-        for k in range(copies):
+        for k in range(single[id(train)]):
             one = copy.deepcopy(train)
             if k:
                 one.set("id", f"{train.get('id', '')}{suffix}{k}")
             found.append(one)
-    single = any(train.tag != "flow" for train in trains)
     notes = [
         f"option scale = {scale:g}: {len(trains)} trains, trips and flows become {len(found)}; flows have {scale:g} times as many"
     ]
-    if single and copies != scale:
+    if scale % 1.0 and single and any(v.tag == "flow" for v in everybody):
         notes.append(
-            f"option scale = {scale:g}: not followed: of trains and trips {copies} each come; the rest would be drawn by SUMO"
+            f"option scale = {scale:g}: not followed: SUMO counts trains of flows, too, where it tells who comes once more"
         )
     return found, notes
+
+
+def often(scale: float, number: int) -> int:
+    """How often a vehicle comes before which ``number`` others were loaded: SUMO spreads a fraction evenly, in thousandths."""
+    whole, thousandths = int(scale), int(scale % 1.0 * 1000 + 0.5)
+    return whole + (number % 1000 * thousandths % 1000 < thousandths)
 
 
 def _flow(flow: Element, scale: float) -> Element:

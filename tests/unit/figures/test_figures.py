@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -9,10 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 import tomli_w
+from hypothesis import given
+from hypothesis import strategies as st
 from matplotlib.figure import Figure
+from PIL import Image
 
 from trainctl.errors import InputError
-from trainctl.figures import style
+from trainctl.figures import catalogue, style
 from trainctl.figures.catalogue import FIGURES, applicable, comparison, drawable, figure, plot
 from trainctl.laws import shipped
 from trainctl.plants.actuated_units import COLUMNS as UNIT_EXTRAS
@@ -101,6 +106,7 @@ CASES = {
 def test_each_law_gets_its_papers_figures(tmp_path: Path, law: str, monkeypatch: pytest.MonkeyPatch) -> None:
     options, expected = CASES[law]
     monkeypatch.setattr(style, "DPI", 40)  # what is drawn counts here, not how finely
+    monkeypatch.setattr(catalogue, "is_example", lambda run, law: True)
     files = plot(made_up(tmp_path / "run", law, **options), tmp_path / "out", formats=("png",))
     assert {path.stem for path in files} == expected
     assert all(path.stat().st_size > 1000 for path in files)
@@ -114,7 +120,15 @@ def test_a_law_without_links_units_or_reference_still_has_figures(tmp_path: Path
         assert isinstance(figure(run, name, "single"), Figure)
 
 
-def test_the_comparisons_of_two_papers_have_their_numbers(tmp_path: Path) -> None:
+def test_numbers_of_a_paper_only_where_it_is_its_example(tmp_path: Path, finished: Callable[..., Run]) -> None:
+    own = finished("fully_distributed", "numeric", **{"run.duration_s": 60})
+    assert applicable(drawable(own))["positions"] == "fig3_positions"
+    for other in (finished("three_tracks", "numeric", **{"run.duration_s": 60}), made_up(tmp_path, "fully_distributed")):
+        assert applicable(drawable(other))["positions"] == "positions"
+
+
+def test_the_comparisons_of_two_papers_have_their_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(catalogue, "is_example", lambda run, law: True)
     ordinary = made_up(tmp_path / "a", "emu_finite_time", units=2, controller={"law": "emu_finite_time", "alpha_1": 1.0})
     assert applicable(drawable(ordinary))["unit_speeds"] == "fig7_ordinary_consensus_unit_speeds"
     other = made_up(tmp_path / "b", "fault_tolerant", units=2, observer={"kind": "intermediate"})
@@ -130,10 +144,92 @@ def test_axes_have_units_and_bounds_are_dashed(tmp_path: Path) -> None:
         assert "[" in shown.axes[-1].get_xlabel(), name
         assert all("[" in axes.get_ylabel() for axes in shown.axes), name
         assert all(not axes.get_legend() for axes in shown.axes), name  # it stands outside the data
-        assert shown.legends, name
+        assert {"2", "3"} <= named_in(shown), name  # nobody is ahead of the first
     dashed = [line for line in figure(run, "speeds").axes[0].lines if line.get_label() == "bound"]
     assert sorted(float(np.ravel(line.get_ydata())[0]) for line in dashed) == [75.0, 85.0]
     assert all(line.is_dashed() for line in dashed)
+
+
+def named_in(shown: Figure) -> set[str]:
+    """Trains named beside their lines, on them, or in a legend; a link names both its trains."""
+    words = [text.get_text() for axes in shown.axes for text in axes.texts]
+    words += [text.get_text() for found in shown.legends for text in found.get_texts()]
+    return set(re.findall(r"\d+", " ".join(words)))
+
+
+def test_lines_are_named_beside_their_ends_and_never_on_each_other(tmp_path: Path) -> None:
+    shown = figure(made_up(tmp_path, "fully_distributed", trains=6), "speeds")  # all end at the same speed
+    labels = [text for text in shown.axes[0].texts if text.get_text().startswith("train ")]
+    assert [text.get_text() for text in labels] == [f"train {k}" for k in range(6, 0, -1)]
+    assert np.diff([text.xy[1] for text in labels]).min() > 0.9 * style.LINE_SHARE
+    assert not any(text.get_text().startswith("train") for found in shown.legends for text in found.get_texts())
+
+
+@given(st.lists(st.floats(0.0, 1.0), max_size=30).map(sorted))
+def test_labels_keep_their_distance_and_stay_inside(places: list[float]) -> None:
+    moved = style.spread(places, 0.06)
+    apart = min(0.06, 1.0 / max(len(places) - 1, 1))
+    assert all(b - a > apart - 1e-9 for a, b in pairwise(moved))
+    assert all(-1e-9 <= place <= 1.0 + 1e-9 for place in moved)
+    if all(b - a >= 0.06 for a, b in pairwise(places)):
+        assert moved == pytest.approx(places)
+
+
+def test_a_bound_far_from_the_data_does_not_squeeze_them(tmp_path: Path) -> None:
+    (panel,) = figure(
+        made_up(tmp_path, "fully_distributed", bounds={"speed_lower_mps": 0.0, "speed_upper_mps": 85.0}), "speeds"
+    ).axes
+    low, high = panel.get_ylim()
+    assert low > 70.0 and high > 85.0  # the far one is left out, the near one is in sight
+    assert any("bound 0" in text.get_text() for text in panel.texts)
+
+
+def test_events_stand_in_every_panel_over_time(tmp_path: Path) -> None:
+    run = made_up(tmp_path, "robust_constrained")
+    for name in ("speeds_and_inputs", "positions", "spacing", "train_graph"):
+        for panel in figure(run, name).axes:
+            assert [line.get_xdata()[0] for line in panel.lines if line.get_gid() == style.EVENT] == [20.0], name
+    assert "topology" in {text.get_text() for text in figure(run, "speeds").axes[0].texts}
+
+
+def test_couplers_at_rest_have_no_figure(tmp_path: Path) -> None:
+    run = made_up(tmp_path, "emu_finite_time", units=2)
+    assert "coupler_forces" in applicable(drawable(run))
+    run.units[["coupler_m", "coupler_force_n"]] *= 1e-9  # rounding
+    assert not {"couplers", "coupler_forces"} & set(applicable(drawable(run)))
+
+
+def test_hours_and_kilometres_per_hour_by_option(tmp_path: Path) -> None:
+    run = made_up(tmp_path, "fully_distributed")
+    plain, shown = figure(run, "speeds").axes[0], figure(run, "speeds", clock=True, kmh=True).axes[0]
+    assert (shown.get_xlabel(), shown.get_ylabel()) == ("time [h:min]", "speed [km/h]")
+    ours, si = (next(line.get_ydata() for line in axes.lines if line.get_label() == "train 1") for axes in (shown, plain))
+    assert ours == pytest.approx(3.6 * si)
+    assert [style.on_the_clock(t) for t in (0.0, 90.0, 3660.0, 90000.0)] == ["00:00", "00:01:30", "01:01", "25:00"]
+
+
+def test_a_figure_says_what_it_was_drawn_from(tmp_path: Path) -> None:
+    run = made_up(tmp_path / "run", "fully_distributed", title="Three trains")
+    files = {path.suffix: path for path in plot(run, tmp_path / "out", formats=("png", "svg", "pdf")) if path.stem == "train_graph"}
+    with Image.open(files[".png"]) as picture:
+        assert picture.info["Title"] == "train_graph of Three trains"
+        assert re.search(r"Three trains, law fully_distributed, trainctl \S+, .*seed 1", picture.info["Description"])
+    assert "seed 1" in files[".svg"].read_text()
+    below = figure(run, "speeds", caption=True)
+    assert "seed 1" in below.get_supxlabel()
+    assert figure(run, "speeds").get_supxlabel() == ""
+
+
+def test_of_many_trains_the_graph_shows_what_each_gained(tmp_path: Path) -> None:
+    run = made_up(tmp_path, "fully_distributed", trains=31)
+    absolute, gained = figure(run, "train_graph").axes
+    assert "gained" in gained.get_ylabel()
+    assert all(
+        line.get_ydata()[0] == pytest.approx(0.0)
+        for line in gained.lines
+        if line.get_label() != "_child1" and len(line.get_xdata()) == STEPS
+    )
+    assert absolute.get_position().height < gained.get_position().height
 
 
 def test_every_numbered_figure_exists() -> None:

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import base64
 import json
+import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.colors import to_hex
 
 from trainctl.cli import program as cli
 from trainctl.errors import InputError
 from trainctl.figures import catalogue
-from trainctl.figures.trains import MARKS, drawable
+from trainctl.figures.corridors import corridors
+from trainctl.figures.train_graph import MARKS
+from trainctl.figures.trains import drawable
 from trainctl.report.animation import animation
 from trainctl.report.page import page
 from trainctl.runner import run
@@ -55,21 +59,51 @@ def test_there_is_no_common_reference_but_a_cruising_speed(merging):
 
 def test_no_line_where_a_train_is_not_there_and_marks_where_something_happened(merging):
     axes = catalogue.figure(merging, "train_graph").axes
-    assert len(axes) == 1
     first = merging.trains.astype({"train": str}).groupby("train")["time_s"].min()
     colour = {name: to_hex(c) for name, c in drawable(merging).colour.items()}
-    marks = {mark: 0 for mark, _ in MARKS.values()}
-    for line in axes[0].lines:
-        if line.get_marker() in marks:
-            marks[line.get_marker()] += 1
-            continue
+    marked = {mark: set() for mark, _ in MARKS.values()}
+    for line in (line for panel in axes for line in panel.lines if to_hex(line.get_color()) in colour.values()):
         x, y = (np.asarray(v, float) for v in line.get_data())
         (name,) = [name for name, c in colour.items() if c == to_hex(line.get_color())]
+        if line.get_marker() in marked:
+            marked[line.get_marker()].add((name, float(x[0])))
+            continue
         assert np.min(x[np.isfinite(y)], initial=np.inf) >= first[name]
         assert line.get_linestyle() in ("-", ":")
-    happened = {mark: sum(e["kind"] == kind for e in merging.events) for kind, (mark, _) in MARKS.items()}
-    assert marks == happened
-    assert happened["^"] >= 3 and happened["s"] == 1 and happened["D"] >= 2
+    happened = {mark: {(e["train"], e["time_s"]) for e in merging.events if e["kind"] == kind} for kind, (mark, _) in MARKS.items()}
+    assert marked == happened
+    assert len(happened["^"]) >= 3 and len(happened["s"]) == 1 and len(happened["D"]) >= 2
+
+
+def test_two_branches_are_two_corridors_and_places_have_their_names(merging):
+    west, south = corridors(merging, drawable(merging).trains)
+    assert (west.name, south.name) == ("from_west to to_east", "from_south to to_north")
+    assert {place.name: place.kind for place in west.places} == {"junction": "junction", "trunk": "stop", "fork": "junction"}
+    at = {place.name: place.at_m for place in west.places}
+    for name, distance in west.distance.items():  # those of the branch are in this panel between the junction and the fork alone
+        if name.startswith("branch"):
+            assert at["junction"] - 50.0 < np.nanmin(distance) and np.nanmax(distance) < at["fork"] + 50.0
+    assert np.nanmin(south.distance["branch.0"]) < 1000.0
+    shown = catalogue.figure(merging, "train_graph").axes
+    assert [panel.get_title(loc="left") for panel in shown] == [west.name, south.name]
+    words = {text.get_text() for text in shown[0].texts}
+    assert {"junction", "trunk", "fork", "fast.0", "stopping"} <= words
+
+
+def test_planned_times_stand_beside_actual_ones(merging, tmp_path):
+    folder = tmp_path / "planned"
+    shutil.copytree(merging.folder, folder)
+    (stop,) = [e for e in merging.events if e["kind"] == "stop_reached"]
+    at = stop["time_s"]
+    pd.DataFrame({
+        "train": ["stopping"], "stop": ["trunk"], "platform": ["trunk"], "number": [1], "planned_arrival_s": [at - 60.0],
+        "arrival_s": [at], "planned_departure_s": [at - 20.0], "departure_s": [np.nan], "delay_s": [60.0],
+    }).to_parquet(folder / "stops.parquet")  # fmt: skip
+    panel, *_ = catalogue.figure(Run(folder), "train_graph").axes
+    (plan,) = [line for line in panel.lines if line.get_gid() == "planned"]
+    assert plan.get_xdata().tolist() == [at - 60.0, at - 20.0]
+    assert plan.get_ydata() == pytest.approx(15.9, abs=0.2)
+    assert "+60 s" in {text.get_text() for text in panel.texts}
 
 
 def test_the_page_shows_the_net_as_it_lies(merging):
@@ -97,7 +131,7 @@ def test_commands_work_on_such_runs(merging, numeric, tmp_path, monkeypatch, cap
     for command in ("check merging", f"metrics {merging.folder}", f"metrics {merging.folder} --all --json"):
         assert typed(monkeypatch, capsys, *command.split())
     files = typed(monkeypatch, capsys, "plot", merging.folder, "--out", tmp_path / "figures").split()
-    assert {"train_graph.png", "fig3_positions.png", "fig4_spacing.png"} <= {name.rpartition("/")[2] for name in files}
+    assert {"train_graph.png", "positions.png", "spacing.png"} <= {name.rpartition("/")[2] for name in files}
     assert "no difference" in typed(monkeypatch, capsys, "diff", merging.folder, merging.folder)
     found = json.loads(typed(
         monkeypatch, capsys, "compare", merging.folder, numeric.folder, "--out", tmp_path / "compare", "--json"
@@ -186,7 +220,9 @@ def test_any_rail_net_is_drawn(merging, tmp_path, monkeypatch, capsys):
 def test_tables_of_such_runs_name_trains_only_while_they_are_there(numeric):
     again = Run(numeric.folder)
     assert again.trains["in_formation"].isin((0.0, 1.0)).all()
-    assert set(again.trains["train"].astype(str)) < {t["id"] for t in again.scenario["train"]}
+    first = again.trains.astype({"train": str}).groupby("train").time_s.min()
+    assert first.to_dict() == {e["train"]: e["time_s"] for e in again.events if e["kind"] == "depart"}
+    assert first["fast.1"] == 70.0
 
 
 @pytest.mark.parametrize("place", [120, 400, 1200])

@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 import tomli_w
 
+from trainctl.cli.program import settling
 from trainctl.errors import InputError
 from trainctl.metrics.run import DEFINITIONS, metrics
 from trainctl.metrics.traffic import metrics_of_fcd
@@ -157,6 +158,22 @@ def test_formation(tmp_path: Path) -> None:
     assert wide["formation.window_settling_s/0"] is None
     assert wide["formation.window_settling_s/2"] == 0.0
     assert metrics(run, band_m=20.0)["formation.window_settling_s/0"] == 0.0
+    assert values["formation.last_link_s"] == 3.0
+
+
+def test_settling_is_a_time_of_the_run(tmp_path: Path) -> None:
+    """The same links from 100 s on, in a run that began at 100 s."""
+    tables = {name: columns | {"time_s": np.asarray(columns["time_s"]) + 100.0} for name, columns in three_trains().items()}
+    values = metrics(run_folder(tmp_path, tables, scenario()), band_m=5.5)
+    assert (values["formation.settling_s"], values["formation.last_link_s"]) == (102.0, 103.0)
+
+
+def test_settling_in_words() -> None:
+    known = {"run.duration_s": 960.0, "formation.settling_s": 380.0, "formation.last_link_s": 766.0}
+    assert settling(known) == "from 380 s, last link at 766 s"
+    assert settling(known | {"formation.last_link_s": 960.0}) == "from 380 s"
+    assert settling(known | {"formation.settling_s": None}) == "not by the end, last link at 766 s"
+    assert settling({"run.duration_s": 960.0}) == ""
 
 
 def test_overshoot_in_one_window_and_speeds(tmp_path: Path) -> None:

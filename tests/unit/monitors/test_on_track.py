@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from trainctl.monitors.on_track import Track, Watch, limits, overlaps, track
+from trainctl.railway.signs import signs
 from trainctl.railway.ways import ways
 from trainctl.signals import Seen
 
@@ -108,14 +109,14 @@ def test_a_train_that_has_just_come_has_not_moved():
     """One enters where another has just been: nobody ran through anybody."""
     rails = SimpleNamespace(edges=("a",), before=((),), twin=np.array([-1]), length_m=np.array([100.0]), speed_mps=np.array([30.0]))
     line = SimpleNamespace(edges=("a",), tracks=("1",), start_m=np.array([1000.0]))
-    watch = Watch(("A", "B"), np.zeros(2), np.ones(2), rails, line, net=False)
+    watch = Watch(("A", "B"), np.zeros(2), np.ones(2), rails, line, net=False, signs=signs((), {}))
     laid = ways([[0], [0]], np.zeros(1), np.array([100.0]))
     seen, last = Seen(np.array([10.0, 20.0]), np.zeros(2, np.int64), laid.first[:-1], np.array([True, False])), watch.initial()
-    assert list(watch.violated(laid, seen, np.full(2, 25.0), last)) == []
+    assert list(watch.violated(0.0, laid, seen, np.full(2, 25.0), last)) == []
     seen = seen._replace(position=np.array([35.0, 20.0]), present=np.array([True, True]))
-    assert list(watch.violated(laid, seen, np.full(2, 25.0), last)) == []
+    assert list(watch.violated(0.0, laid, seen, np.full(2, 25.0), last)) == []
     seen = seen._replace(position=np.array([60.0, 80.0]))
-    told, fast = watch.violated(laid, seen, np.array([25.0, 60.0]), last)
+    told, fast = watch.violated(0.0, laid, seen, np.array([25.0, 60.0]), last)
     assert fast == {"bound": "line_speed_mps", "who": "B", "value": 60.0, "limit": 30.0, "edge": "a"}
     assert told == {
         "bound": "gap_m", "who": "A-B", "value": -20.0, "limit": 0.0, "trains": ["A", "B"], "edge": "a", "edge_m": 80.0, "track": "1",

@@ -48,7 +48,7 @@ CASES = {
     "route over an edge that is not there": ([(ROUTES, "from_south trunk", "from_north trunk")], ["branch", "from_north"]),
     "vType without data": (
         [("mistaken.toml", "[train_type.emu]", "[train_type.other]")],
-        ["vType emu: no mass, no maxPower", "add [train_type.emu] to the scenario"],
+        ["vType emu: no mass, no maxPower", "add [train_type.emu] or, for all such types,"],
     ),
     "no such configuration": ([(CONFIGURATION, "", None)], ["merging.sumocfg: no such file"]),
     "configuration is not XML": ([(CONFIGURATION, "", "nonsense")], ["merging.sumocfg: not XML: "]),
@@ -125,7 +125,7 @@ def test_each_mistake_is_told_in_words(case, typed, tmp_path):
 
 
 def test_what_such_runs_cannot_do_is_said_at_once(typed, tmp_path):
-    code, lines = typed("run", "mistaken.toml", "--set", "controller.law=sumo", "--out", "r")
+    code, lines = typed("run", "mistaken.toml", "--set", "controller.law=sumo", "--set", "controller.block=fixed", "--out", "r")
     assert code == 2 and "merging.net.xml has no rail signals" in lines[0]
     assert not (tmp_path / "r").exists() and not (tmp_path / "r.partial").exists()
 

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import nets
+import numpy as np
 import pytest
 
 from sumo_net.build import program
 from trainctl.errors import InputError
 from trainctl.scenario.tables import TrainType
-from trainctl.scenario.train_types import train_type
-from trainctl.traffic.kinds import Kind
+from trainctl.scenario.train_types import fitted, train_type
+from trainctl.traffic.kinds import RAIL_MODEL, Kind
 from trainctl.traffic.read import Configuration, read_traffic
 
 NODES = """<nodes><node id="a" x="0" y="0"/><node id="b" x="2000" y="0"/><node id="c" x="4000" y="0"/><node id="d" x="7000" y="0"/>
@@ -84,10 +87,10 @@ def in_sumo(folder: Path, script: str) -> Any:
 
 def test_flows_become_trains(files: Files) -> None:
     traffic = files.read(
-        '<flow id="n" type="t" begin="20" number="3" end="50" route="main"/>'
         '<flow id="p" type="t" begin="0" period="30" end="100" route="main"/>'
-        '<flow id="h" type="t" begin="5" vehsPerHour="120" end="100" from="ab" to="cd"/>'
         '<flow id="q" type="t" begin="0" number="2" period="7.25" route="main"/>'
+        '<flow id="h" type="t" begin="5" vehsPerHour="120" end="100" from="ab" to="cd"/>'
+        '<flow id="n" type="t" begin="20" number="3" end="50" route="main"/>'
     )
     times = {name: [d.depart_s for d in traffic.departures if d.id.startswith(f"{name}.")] for name in "nphq"}
     assert times == {"n": [20, 30, 40], "p": [0, 30, 60, 90], "h": [5, 35, 65, 95], "q": [0, 7.25]}
@@ -111,6 +114,63 @@ def test_the_same_seed_draws_the_same(files: Files) -> None:
     assert {d.kind for d in one.departures} == {"m1", "m2", "t"} == set(one.kinds)
     assert {d.edges for d in one.departures} == {("ab", "bc", "cd"), ("xb", "bc")}
     assert 80 < sum(d.id.startswith("f.") for d in one.departures) < 160  # 120 expected
+
+
+def test_what_is_random_of_a_train_is_drawn_for_each_by_its_name(files: Files) -> None:
+    said = 'departPos="random" departSpeed="random" arrivalPos="random" departEdge="random" arrivalEdge="random"'
+    vehicles = [f'<vehicle id="v{k}" type="t" depart="{k}" route="main" {said}/>' for k in range(60)]
+    one = {d.id: d for d in files.read("".join(vehicles)).departures}
+    few = files.read("".join(vehicles[7:9])).departures
+    assert [one[d.id] for d in few] == list(few)  # whoever else there is
+    length = {"ab": 2000.0, "bc": 2000.0, "cd": 3000.0}
+    assert all(0.0 <= d.position_m <= length[d.edges[0]] and 0.0 <= d.arrival_m <= length[d.edges[-1]] for d in one.values())
+    depth = sorted(d.position_m / length[d.edges[0]] for d in one.values())
+    speeds = sorted(d.speed_mps for d in one.values())
+    assert depth[15] < 0.4 and depth[45] > 0.6 and speeds[0] < 7.0 and 29.0 < speeds[-1] < 36.0  # 0.9 x 40 m/s
+    assert {d.edges for d in one.values()} == {("ab", "bc", "cd"), ("ab", "bc"), ("ab",), ("bc", "cd"), ("bc",), ("cd",)}
+    assert read_traffic(files.sumocfg, files.folder / "work", seed=7).departures != few
+
+
+@pytest.mark.parametrize("scale", [0.3, 0.75, 1.5, 2.25])
+def test_a_fraction_of_the_trains_comes_that_comes_in_sumo(files: Files, scale: float) -> None:
+    files.write("".join(f'<vehicle id="v{k}" type="t" depart="{10 * k}" route="main"/>' for k in range(12)))
+    files.sumocfg.write_text(files.sumocfg.read_text().replace("<time>", f'<scale value="{scale}"/><time>'))
+    sumo, environment = program("sumo")
+    options = ["--no-step-log", "--insertion-checks", "none", "--tripinfo-output", "t.xml"]
+    subprocess.run([sumo, "-c", "run.sumocfg", *options], cwd=files.folder, env=environment, check=True, capture_output=True)
+    theirs = set(re.findall(r'tripinfo id="([^"]*)"', (files.folder / "t.xml").read_text()))
+    assert {d.id for d in read_traffic(files.sumocfg, files.folder / "work").departures} == theirs
+
+
+def test_trains_out_of_order_in_a_route_file_do_not_come_as_in_sumo(files: Files) -> None:
+    def v(name: str, depart: float, kind: str = 'type="t"') -> str:
+        return f'<vehicle id="{name}" {kind} depart="{depart}"><route edges="ab bc cd"/></vehicle>'
+
+    flow = '<flow id="f" type="t" begin="90" period="60" number="2" route="main"/>'
+    body = v("a", 40) + v("b", 0) + v("c", 60) + f'<trip id="d" type="t" depart="50" from="ab" to="cd"/>{v("e", 100)}{flow}'
+    own, of = '<vType id="o" vClass="rail"/>', 'type="o"'
+    traffic = files.read(body, stops=STOPS.replace("</additional>", f"{own}{v('g', 30, of)}{v('h', 20, of)}</additional>"))
+    sumo, environment = program("sumo")
+    options = ["--no-step-log", "--insertion-checks", "none", "--tripinfo-output", "t.xml"]
+    subprocess.run([sumo, "-c", "run.sumocfg", *options], cwd=files.folder, env=environment, check=True, capture_output=True)
+    theirs = set(re.findall(r'tripinfo id="([^"]*)"', (files.folder / "t.xml").read_text()))
+    assert {d.id for d in traffic.departures} == theirs == set("aceg") | {"h"}
+    told = "3 vehicles, trips and flows left out, as in SUMO: a route file goes by departure times: b, d, f"
+    assert told in traffic.notes
+
+
+def test_mistakes_in_signs_and_rerouters_are_told(files: Files) -> None:
+    wrong = (
+        '<variableSpeedSign id="s" lanes="nope_0"><step time="x" speed="y"/></variableSpeedSign><variableSpeedSign id="u"/>'
+        '<rerouter id="r" edges="ab nope" probability="p"><interval begin="z"><closingReroute id="gone"/></interval></rerouter>'
+    )
+    told = files.mistakes(f'{V} route="main"/>', stops=STOPS.replace("</additional>", f"{wrong}</additional>"))
+    assert told == [f"{files.sumocfg}: {line}" for line in (
+        "variableSpeedSign s: lane nope_0: not in the net", "variableSpeedSign s: step time = x: must be a time",
+        "variableSpeedSign s: step speed = y: must be a number", "variableSpeedSign u: no lanes",
+        "rerouter r: edge nope: not in the net", "rerouter r: probability = p: must be a number, not negative",
+        "rerouter r: interval z: must be a time", "rerouter r: closingReroute gone: not in the net",
+    )]  # fmt: skip
 
 
 def test_trips_become_the_routes_of_sumo(files: Files) -> None:
@@ -229,7 +289,7 @@ def test_what_is_not_followed_is_told(files: Files) -> None:
         '<vehicle id="v" type="loose" depart="0" departPos="random" departSpeed="avg" arrivalSpeed="0" speedFactor="0.7"><route '
         'edges="ab bc"/><stop lane="bc_0" endPos="20" duration="3" triggered="true"/></vehicle>'
         '<person id="p" depart="0"><walk edges="zx"/></person><containerFlow id="k" begin="0" number="1" end="5"/>',
-        stops=STOPS.replace("</additional>", '<rerouter id="r" edges="ab"/></additional>'),
+        stops=STOPS.replace("</additional>", '<calibrator id="r" edge="ab"/></additional>'),
     )
     assert [d.id for d in traffic.departures] == ["v"]
     assert set(traffic.kinds) == {"loose"} and traffic.kinds["loose"].speed_factor == 0.8
@@ -237,13 +297,13 @@ def test_what_is_not_followed_is_told(files: Files) -> None:
         "1 definitions of persons left out",
         "1 definitions of containers left out",
         "2 vehicles, trips and flows left out: not rail",
-        'departPos="random": the train begins with its rear at the beginning of the edge, as with "base"',
+        '1 x departPos="random": drawn here, with other numbers than SUMO\'s',
         "vType loose: speedFactor = normc(0.8,0.1,0.2,1): its mean 0.8 for every train",
         "option step-length = 0.5: not followed: the step is run.step_s of the scenario",
         "1 x <vehicle arrivalSpeed>: not followed: trains leave as fast as they come",
         "1 x <vehicle speedFactor>: not followed: that of the vType holds",
         "1 x <stop triggered>: not followed: nobody boards; a train stands as long as duration and until say",
-        "1 x <rerouter>: not followed: trains keep their routes",
+        "1 x <calibrator>: not followed: no train is let in or taken out by it",
     )
 
 
@@ -447,10 +507,9 @@ def test_what_a_type_lacks_is_told_in_one_line() -> None:
         return train_type(Kind("ICE", "rail", 200.0, 80.0, 1.0, attributes))
 
     constants = "mass, maxPower, maxTraction, resCoef_constant, resCoef_linear, resCoef_quadratic"
-    cure = f'add [train_type.ICE] to the scenario, or carFollowModel="Rail" trainType="custom" with {constants} to the vType'
+    cure = f'add [train_type.ICE] or, for all such types, [train_type."*"] to the scenario, or carFollowModel="Rail" trainType="custom" with {constants} to the vType'
     assert said() == [f"vType ICE: {', '.join(f'no {key}' for key in constants.split(', '))}: {cure}"]
     lacking = "no maxPower, no maxTraction, no resCoef_constant, no resCoef_linear, no resCoef_quadratic"
-    assert said(carFollowModel="Rail", trainType="ICE3") == [f"vType ICE: {lacking} (SUMO has trainType ICE3 as tables): {cure}"]
     assert said(maxPower="1", mass="80000") == [f"vType ICE: {lacking}: {cure}"]  # no other model takes notice of maxPower
     whole = dict.fromkeys(constants.split(", "), "1") | {"carFollowModel": "Rail", "trainType": "custom"}
     assert isinstance(said(**whole), TrainType)
@@ -459,6 +518,52 @@ def test_what_a_type_lacks_is_told_in_one_line() -> None:
         "vType ICE: maxPower = -3: must be a number, not negative",
     ]
     assert said(**whole | {"mass": "0"}) == ["vType ICE: mass = 0: must be above 0"]
+
+
+TRAIN_TYPES = sorted(RAIL_MODEL.keys() - {"custom"})
+
+
+def test_train_types_of_sumo_move_as_in_sumo(tmp_path: Path) -> None:
+    """The acceleration of each, at full effort up to its maximum speed, is SUMO's within the error stated, and comes near it."""
+    nets.net(tmp_path, {"a": (0, 0), "b": (300000, 0)}, {"ab": ("a", "b", {"speed": 200})})
+    types = "".join(
+        f'<vType id="{t}" vClass="rail" carFollowModel="Rail" trainType="{t}" sigma="0" speedDev="0"/>' for t in TRAIN_TYPES
+    )
+    trains = "".join(
+        f'<vehicle id="{t}" type="{t}" depart="0" departSpeed="0" departPos="{1e4 * (k + 1)}" insertionChecks="none">'
+        '<route edges="ab"/></vehicle>'
+        for k, t in enumerate(TRAIN_TYPES)
+    )
+    nets.traffic(tmp_path, trains, types)
+    script = f"""libsumo.start(["sumo", "-c", "a.sumocfg", "--no-step-log", "--no-warnings", "--railsignal-moving-block"])
+names = {TRAIN_TYPES}
+libsumo.simulationStep()
+for _ in range(250):
+    out.append([libsumo.vehicle.getSpeed(name) for name in names])
+    libsumo.simulationStep()
+"""
+    speeds = np.array(in_sumo(tmp_path, script))
+    kinds = read_traffic(tmp_path / "a.sumocfg", tmp_path / "work").kinds
+    for k, name in enumerate(TRAIN_TYPES):
+        data, built = train_type(kinds[name]), RAIL_MODEL[name]
+        assert isinstance(data, TrainType)
+        v, gain = speeds[:-1, k], np.diff(speeds[:, k])
+        free = (v + gain < built.speed_mps - 0.01) & (gain > 0.0)
+        mass, factor = built.mass_kg, built.mass_factor
+        pull = np.minimum(data.traction_n, data.traction_power_w / np.maximum(v, 1e-9)) / mass
+        drag = data.c0_n_per_kg + data.c1_ns_per_m_kg * v + data.c2_ns2_per_m2_kg * v * v
+        error = float(np.max(np.abs((pull - drag) / factor - gain)[free]))
+        assert free.sum() > 30 and 0.3 * built.error_mps2 < error <= built.error_mps2, (name, error)
+    assert len(fitted(kinds.values())[0].split("within")) == len(TRAIN_TYPES) + 1
+
+
+def test_types_without_data_have_those_of_the_rest_with_what_they_state_themselves() -> None:
+    rest = TrainType(unit_length_m=50.0, units=2, unit_mass_kg=40e3, c0_n_per_kg=0.01, c1_ns_per_m_kg=0.0, c2_ns2_per_m2_kg=0.0)
+    plain = train_type(Kind("p", "rail", 90.0, 40.0, 1.0, {}), rest)
+    assert isinstance(plain, TrainType) and (plain.unit_length_m, plain.unit_mass_kg, plain.braking_n) == (45.0, 40e3, None)
+    heavy = train_type(Kind("h", "rail", 90.0, 40.0, 1.0, {"mass": "100000", "decel": "0.5"}), rest)
+    assert isinstance(heavy, TrainType) and heavy.unit_mass_kg == (50e3, 50e3) and heavy.braking_n == (25e3, 25e3)
+    assert train_type(Kind("w", "rail", 90.0, 40.0, 1.0, {"mass": "0"}), rest) == ["vType w: mass = 0: must be a number above 0"]
 
 
 @pytest.mark.parametrize("name", ["rail", "rail_demo"])

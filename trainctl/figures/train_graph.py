@@ -1,0 +1,190 @@
+"""The train graph of the trade: distance against time with places by name, train numbers on the lines, planned against actual."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import matplotlib.patheffects as effects
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from trainctl.figures import style
+from trainctl.figures.corridors import Corridor, corridors, crossovers
+from trainctl.figures.trains import Drawn, in_and_out, in_formation, mark_events
+from trainctl.signals import Floats, leader_over
+
+#: Marks on a train's own line where trains come and go, and their words.
+MARKS = {
+    "couple": ("^", "couples"), "uncouple": ("v", "uncouples"), "stop_reached": ("s", "stops"),
+    "conflict": ("D", "waits for its turn"), "reroute": ("o", "new route"), "reroute_refused": ("x", "route refused"),
+    "supervisor": ("|", "supervisor acts"),
+}  # fmt: skip
+#: Trains of one panel whose numbers stand on their lines, at most.
+NUMBERED = 30
+#: Below this share of the distance covered, a formation is a bundle in which no train is told from another.
+BUNDLE = 0.3
+#: A train later than this at a stop has its delay beside it [s].
+LATE_S = 30.0
+
+
+def train_graph(drawn: Drawn) -> Figure:
+    """Time-distance diagram with the places on the way by name and train numbers on the lines.
+
+    On a line of tracks: one colour per train, one line style per track; below, relative to the reference, where trains 5 km apart
+    can be told from each other, and of many trains how far each has gained on it since the start. Where trains come and go: one
+    panel per corridor, full lines for trains in formations, planned
+    times dashed, and marks on the lines that say what happened.
+    """
+    return _coming_and_going(drawn) if drawn.known.traffic else _on_tracks(drawn)
+
+
+def _on_tracks(drawn: Drawn) -> Figure:
+    reference = drawn.known.reference
+    time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
+    relative = position - (0.0 if reference is None else leader_over(reference, time)[0])
+    crowd = reference is not None and len(drawn.trains.names) > NUMBERED
+    if crowd:  # no one tells its lines apart where they are, but who gains on whom
+        relative = relative - np.repeat(relative[drawn.trains.first[:-1]], np.diff(drawn.trains.first))
+    bundle = crowd or (reference is not None and np.ptp(relative) < BUNDLE * np.ptp(position))
+    heights = {} if reference is None else {"height_ratios": [1, 2] if bundle else [1, 1]}
+    figure, axes = style.panels(1 if reference is None else 2, drawn.width, 60.0, **heights)
+    track = drawn.trains.frame["track"].astype(str).to_numpy()
+    tracks, switched = sorted(set(track), key=lambda name: (len(name), name)), False
+    for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
+        at, on = time[rows], track[rows]
+        cuts = np.flatnonzero(on[1:] != on[:-1]) + 1
+        switched |= len(cuts) > 0
+        for panel, value in zip(axes, (position[rows] / 1000, relative[rows] / 1000), strict=False):
+            for begin, end in zip([0, *cuts], [*cuts, len(at)], strict=True):
+                line = style.TRACK_STYLES[tracks.index(on[begin]) % len(style.TRACK_STYLES)]
+                style.draw(
+                    panel, at[begin : end + 1], value[begin : end + 1], color=drawn.colour[name], linestyle=line, label=label
+                )
+            panel.plot(at[cuts], value[cuts], linestyle="none", marker="o", markersize=4, color=drawn.colour[name], zorder=4)
+            for k in cuts if panel is axes[-1] else ():
+                panel.annotate(
+                    f"{on[k - 1]}→{on[k]}", (at[k], value[k]), xytext=(6, 0), textcoords="offset points", fontsize=6.5,
+                    va="center", color=drawn.colour[name], zorder=5, bbox=style.PAPER,
+                )  # fmt: skip
+    axes[0].set_ylabel("position [km]")
+    if reference is not None:
+        axes[1].set_ylabel("gained on the reference\nsince the start [km]" if crowd else r"$x_i - x_r$ [km]")
+    style.time_axis(axes, drawn.instants[0], drawn.instants[-1], drawn.clock)
+    mark_events(axes, drawn)
+    style.name_places(axes[0], [(p.at_m / 1000, p.name, p.kind) for p in crossovers(drawn.run, drawn.trains)])
+    if not crowd:
+        _number(axes[-1], {name: (time[rows], relative[rows] / 1000) for name, rows in drawn.trains.slices()}, drawn)
+    else:
+        style.name_lines(figure, drawn.width)
+    styles = [
+        Line2D([], [], color=style.GREY, linestyle=style.TRACK_STYLES[k % len(style.TRACK_STYLES)], label=f"track {name}")
+        for k, name in enumerate(tracks)
+    ]
+    if switched:
+        styles.append(Line2D([], [], color=style.GREY, linestyle="none", marker="o", markersize=4, label="changes track"))
+    style.legend(figure, drawn.width, styles)
+    return figure
+
+
+def _coming_and_going(drawn: Drawn) -> Figure:
+    """One panel per corridor: trains of two branches that meet nowhere do not cross in it."""
+    found = corridors(drawn.run, drawn.trains)
+    figure, axes = style.panels(len(found), drawn.width, 84.0 if len(found) == 1 else 66.0)
+    time, inside = drawn.trains.column("time_s"), in_formation(drawn)
+    rows_of = dict(drawn.trains.slices())
+    planned = False
+    for panel, corridor in zip(axes, found, strict=True):
+        for name, distance in corridor.distance.items():
+            rows = rows_of[name]
+            in_and_out(panel, time[rows], distance / 1000, inside[rows], drawn.colour[name], f"_{name}")
+        planned |= _plan(panel, corridor, drawn)
+        panel.set_ylabel("distance [km]")
+        panel.margins(y=0.03)
+        if corridor.name:
+            panel.set_title(corridor.name, loc="left", fontweight="bold")
+    style.time_axis(axes, drawn.instants[0], drawn.instants[-1], drawn.clock)
+    marks = [mark for kind in MARKS for mark in _marks(axes, found, drawn, kind)]
+    for panel, corridor in zip(axes, found, strict=True):
+        style.name_places(panel, [(p.at_m / 1000, p.name, p.kind) for p in corridor.places])
+        _number(panel, {name: (time[rows_of[name]], at / 1000) for name, at in corridor.distance.items()}, drawn)
+    common = [] if inside.all() else [Line2D([], [], color=style.GREY, linestyle=":", linewidth=0.7, label="in no formation")]
+    if planned:
+        common.append(Line2D([], [], color=style.GREY, linestyle=(0, (4, 2)), marker="o", markerfacecolor="white", markersize=3.5,
+                             linewidth=0.8, label="planned"))  # fmt: skip
+    style.legend(figure, drawn.width, [*common, *marks])
+    return figure
+
+
+def _marks(axes: list[Axes], found: list[Corridor], drawn: Drawn, kind: str) -> list[Line2D]:
+    """Marks of one kind of event, each on the line of its train in every panel that has it there; their entry in the legend."""
+    mark, words = MARKS[kind]
+    look: dict[str, Any] = {"linestyle": "none", "marker": mark, "markersize": 4.5, "markeredgecolor": "black"}
+    time, rows_of = drawn.trains.column("time_s"), dict(drawn.trains.slices())
+    events = [e for e in drawn.run.events if e["kind"] == kind and e.get("train") in rows_of]
+    for event in events:
+        name = event["train"]
+        for panel, corridor in zip(axes, found, strict=True):
+            if name in corridor.distance:
+                at = float(np.interp(event["time_s"], time[rows_of[name]], corridor.distance[name] / 1000))
+                if np.isfinite(at):
+                    panel.plot(event["time_s"], at, color=drawn.colour[name], markeredgewidth=0.5, zorder=4, **look)
+    return [Line2D([], [], color=style.GREY, markeredgewidth=0.5, label=f"{words} ({len(events)})", **look)] if events else []
+
+
+def _plan(panel: Axes, corridor: Corridor, drawn: Drawn) -> bool:
+    """Planned times at the stops of a corridor, dashed from stop to stop, and delays beside them; whether there are any."""
+    stops = drawn.run.table("stops", missing_is_empty=True)
+    if not len(stops):
+        return False
+    at_of = {place.name: place.at_m / 1000 for place in corridor.places if place.kind == "stop"}
+    some = False
+    for train, calls in stops.astype({"train": str, "stop": str}).sort_values("number").groupby("train"):
+        name = str(train)
+        if name not in corridor.distance:
+            continue
+        x: list[float] = []
+        y: list[float] = []
+        times = calls[["planned_arrival_s", "planned_departure_s", "arrival_s", "departure_s", "delay_s"]].to_numpy(float)
+        for stop, (arrives, departs, came, left, late) in zip(calls["stop"], times, strict=True):
+            if stop not in at_of:
+                continue
+            planned = [t for t in (arrives, departs) if np.isfinite(t)]
+            x += planned
+            y += [at_of[stop]] * len(planned)
+            if planned and late > LATE_S:
+                at = float(left if np.isfinite(left) else came)
+                panel.annotate(
+                    f"+{late:.0f} s", (at, at_of[stop]), xytext=(3, -3), textcoords="offset points", fontsize=6,
+                    va="top", color=drawn.colour[name], zorder=5, bbox=style.PAPER,
+                )  # fmt: skip
+        if x:
+            panel.plot(
+                x, y, color=drawn.colour[name], linestyle=(0, (4, 2)), linewidth=0.8, marker="o", markersize=3.5,
+                markerfacecolor="white", alpha=0.9, zorder=2, gid="planned",
+            )  # fmt: skip
+            some = True
+    return some
+
+
+def _number(panel: Axes, lines: dict[str, tuple[Floats, Floats]], drawn: Drawn) -> None:
+    """Train numbers along the lines; of many trains every so many-th has its own."""
+    stride = -(-len(lines) // NUMBERED)
+    for k, (name, (x, y)) in enumerate(lines.items()):
+        some = np.flatnonzero(np.isfinite(y))
+        if k % stride or len(some) < 2:
+            continue
+        share = 0.12 + 0.1 * (k // stride % 5)  # numbers of trains that run close together stand one after the other
+        way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(y[some])))])  # where a train stands, marks and places stand too
+        here = int(some[np.searchsorted(way, share * way[-1]).clip(0, len(some) - 1)])
+        reach = max(1, int(0.01 * len(drawn.instants)))
+        a, b = max(here - reach, some[0]), min(here + reach, some[-1])
+        ends = np.array([[x[a], y[a]], [x[b], y[b]]])
+        run = panel.transData.transform(ends) if np.isfinite(ends).all() else np.zeros((2, 2))
+        angle = float(np.degrees(np.arctan2(run[1, 1] - run[0, 1], run[1, 0] - run[0, 0]))) if np.ptp(run) else 0.0
+        panel.text(
+            float(x[here]), float(y[here]), name, fontsize=6.5, color=drawn.colour[name], rotation=angle, rotation_mode="anchor",
+            ha="center", va="center", zorder=5, clip_on=True, gid=f"number {name}",
+            path_effects=[effects.withStroke(linewidth=2.2, foreground="white")],
+        )  # fmt: skip
