@@ -86,7 +86,7 @@ class Traffic:
         self.step_s, self.theta = p.scenario.run.step_s, p.step_theta
         self.net, self.length = along.net(p.rails), p.consists.train_length()
         self.stops_of = np.array([len(stops) for stops in p.roster.stops], np.int64)
-        self.looks = p.looks_ahead
+        self.looks, self.join_range_m = p.looks_ahead, p.driving.join_range_m if p.driven else 0.0
         planned = min(
             p.supervision.emergency_mps2, p.supervision.service_mps2, *([p.driving.deceleration_mps2] if p.driven else [])
         )
@@ -421,9 +421,7 @@ class Traffic:
 
     def _look(self, ways: Ways, seen: Seen, speed: Floats, held: Held, s: State, reach: Floats) -> View:
         """What is ahead of every train."""
-        horizon = float(np.max(reach, where=seen.present, initial=0.0)) + 1000.0
-        if self.p.driven:
-            horizon = max(horizon, self.p.driving.join_range_m)
+        horizon = max(float(np.max(reach, where=seen.present, initial=0.0)) + 1000.0, self.join_range_m)
         return authority.look(
             ways, self.net, self.limit, self.roster.speed_factor, seen.row, seen.position, speed, self.length,
             seen.present, horizon, held.room, interlocking.order(s.requests),
