@@ -34,7 +34,8 @@ def moved_to(browser, time):
         const slider = document.getElementById('slider'), wanted = arguments[0];
         const film = JSON.parse(document.getElementById('data').textContent).animation;
         slider.value = film.time.indexOf(wanted); slider.dispatchEvent(new Event('input'));
-        return [document.getElementById('clock').textContent, document.getElementById('now-links').textContent, document.getElementById('now-trains').textContent];
+        const rows = [...document.querySelectorAll('#rows tr')].map(row => [...row.children].map(cell => cell.textContent));
+        return [document.getElementById('clock').textContent, Object.fromEntries(rows.map(([train, ...cells]) => [train, cells]))];
     """
     return browser.run(script, time)
 
@@ -58,7 +59,7 @@ def test_no_console_error_no_request_and_every_element(page, browser):
         "plot-events",
     } <= {p for p, _ in plots}
     assert all(count > 0 for _, count in plots)
-    for name in ("theme", "view", "play", "slider", "bounds", "now-links"):
+    for name in ("theme", "view", "play", "slider", "bounds", "rows", "trains", "source"):
         assert browser.run(f"return document.getElementById('{name}') !== null"), name
 
 
@@ -73,13 +74,13 @@ def test_slider_at_1000_and_1001_shows_the_change(page, browser, tmp_path):
         pictures.append(browser.run("return document.getElementById('view').toDataURL()"))
         assert told[0] == f"{time} s"
         if time == 1000:
-            assert "1→2" in told[1] and "4→6" in told[1]
-            assert "2: track 1" in told[2] and "5: track 2" in told[2]
+            assert told[1]["2"][0] == "track 1" and told[1]["5"][0] == "track 2"
+            assert (told[1]["2"][3], told[1]["6"][3], told[1]["5"][3]) == ("1, 3", "4", "")
         else:
-            assert "1→3" in told[1] and "5→6" in told[1] and "1→2" not in told[1]
-            assert "2: crossover to track 3" in told[2] and "5: crossover to track 1" in told[2]
+            assert told[1]["2"][0] == "crossover to track 3" and told[1]["5"][0] == "crossover to track 1"
+            assert (told[1]["2"][3], told[1]["3"][3], told[1]["6"][3]) == ("", "1, 4", "5")
     assert pictures[0] != pictures[1]
-    assert "2: track 3" in moved_to(browser, 1020)[2]
+    assert moved_to(browser, 1020)[1]["2"][0] == "track 3"
     assert browser.complaints() == []
 
 
@@ -100,6 +101,37 @@ def test_time_axes_are_linked_and_the_keyboard_works(page, browser):
     browser.press(" ")
     assert browser.run("return document.getElementById('play').textContent") == "Play"
     assert browser.complaints() == []
+
+
+def test_one_moment_stands_in_one_column_and_one_legend_rules_all_plots(page, browser):
+    browser.open(page)
+    browser.until(READY)
+    columns = browser.run(
+        "return [...document.querySelectorAll('.draw')].map(d => [d.offsetLeft + d._fullLayout.xaxis._offset, d._fullLayout.xaxis._length].map(Math.round).join())"
+    )
+    assert len(set(columns)) == 1
+    assert browser.run("return [...document.querySelectorAll('.chip')].map(c => c.dataset.train).join()") == "1,2,3,4,5,6"
+    drawn = """
+        const p = arguments[0], data = JSON.parse(document.getElementById('data').textContent);
+        const traces = data.panels.find(panel => panel.id === p).traces, full = document.querySelector(`#plot-${p} .draw`).data;
+        return [...new Set(traces.filter((t, k) => t.group && full[k].visible !== false).map(t => t.group))].join();
+    """
+    browser.run("document.querySelector('.chip[data-train=\"3\"]').click()")
+    for name in ("graph", "speeds", "inputs", "forces", "energy"):
+        browser.until(f"return (function () {{ {drawn} }})('{name}') === '1,2,4,5,6'")
+    browser.run("document.querySelector('.chip[data-train=\"5\"]').dispatchEvent(new MouseEvent('dblclick'))")
+    browser.until(f"return (function () {{ {drawn} }})('errors') === '5'")
+    browser.run("document.getElementById('everybody').click()")
+    browser.until(f"return (function () {{ {drawn} }})('errors') === '2,3,4,5,6'")
+    assert browser.complaints() == []
+
+
+def test_an_address_names_a_moment(page, browser):
+    browser.open(page)
+    browser.until(READY)
+    browser.run("location.hash = '#t=1001'")
+    browser.until("return document.getElementById('clock').textContent === '1001 s'")
+    assert browser.run("return document.getElementById('moment').getAttribute('href')") == "#t=1001"
 
 
 @pytest.mark.parametrize("dark", [False, True])
@@ -147,7 +179,7 @@ def test_trains_that_come_and_go_are_drawn_on_their_net(finished, browser):
         pictures.append(browser.run("return document.getElementById('view').toDataURL()"))
         assert told[0] == f"{time:g} s"
     assert pictures[0] != pictures[1]
-    assert "stopping: trunk, 0.00 m/s" in told[2]
+    assert (told[1]["stopping"][0], told[1]["stopping"][2]) == ("trunk", "0.00")
     assert browser.complaints() == []
 
 

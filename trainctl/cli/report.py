@@ -27,12 +27,14 @@ def register(app: typer.Typer) -> None:
 def report(
     folder: Annotated[Path, typer.Argument(help="Run folder, as `trainctl run` made it.")],
     out: Annotated[Path | None, typer.Option(help="The page; default FOLDER/report.html.")] = None,
+    clock: Annotated[bool, typer.Option("--clock", help="Time in hours and minutes of the run.")] = False,
+    kmh: Annotated[bool, typer.Option("--kmh", help="Speeds in km/h.")] = False,
 ) -> None:
     """Write one self-contained page about a run: verdicts, the trains on their tracks, linked plots."""
     from trainctl.report.page import report as write
     from trainctl.runs.run import Run
 
-    say(write(Run(folder), out))
+    say(write(Run(folder), out, clock=clock, kmh=kmh))
 
 
 def compare(

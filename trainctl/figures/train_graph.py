@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib.patheffects as effects
 import numpy as np
@@ -99,7 +99,7 @@ def _coming_and_going(drawn: Drawn) -> Figure:
         for name, distance in corridor.distance.items():
             rows = rows_of[name]
             in_and_out(panel, time[rows], distance / 1000, inside[rows], drawn.colour[name], f"_{name}")
-        planned |= _plan(panel, corridor, drawn)
+        planned |= _draw_plans(panel, corridor, drawn)
         panel.set_ylabel("distance [km]")
         panel.margins(y=0.03)
         if corridor.name:
@@ -133,39 +133,56 @@ def _marks(axes: list[Axes], found: list[Corridor], drawn: Drawn, kind: str) -> 
     return [Line2D([], [], color=style.GREY, markeredgewidth=0.5, label=f"{words} ({len(events)})", **look)] if events else []
 
 
-def _plan(panel: Axes, corridor: Corridor, drawn: Drawn) -> bool:
-    """Planned times at the stops of a corridor, dashed from stop to stop, and delays beside them; whether there are any."""
+class Plan(NamedTuple):
+    """Planned times of one train along a corridor, and where it was late."""
+
+    time: list[float]  # s
+    distance: list[float]  # km
+    late: list[tuple[float, float, float]]  # of each stop left or reached late: when [s], where [km], by how much [s]
+
+
+def plans(drawn: Drawn, corridor: Corridor) -> dict[str, Plan]:
+    """The timetable of the trains of a corridor, from stops.parquet; empty without one."""
     stops = drawn.run.table("stops", missing_is_empty=True)
     if not len(stops):
-        return False
+        return {}
     at_of = {place.name: place.at_m / 1000 for place in corridor.places if place.kind == "stop"}
-    some = False
+    columns = ["planned_arrival_s", "planned_departure_s", "arrival_s", "departure_s", "delay_s"]
+    found: dict[str, Plan] = {}
     for train, calls in stops.astype({"train": str, "stop": str}).sort_values("number").groupby("train"):
-        name = str(train)
-        if name not in corridor.distance:
-            continue
-        x: list[float] = []
-        y: list[float] = []
-        times = calls[["planned_arrival_s", "planned_departure_s", "arrival_s", "departure_s", "delay_s"]].to_numpy(float)
-        for stop, (arrives, departs, came, left, late) in zip(calls["stop"], times, strict=True):
-            if stop not in at_of:
-                continue
-            planned = [t for t in (arrives, departs) if np.isfinite(t)]
-            x += planned
-            y += [at_of[stop]] * len(planned)
+        plan = Plan([], [], [])
+        for stop, (arrives, departs, came, left, late) in zip(calls["stop"], calls[columns].to_numpy(float), strict=True):
+            planned = [t for t in (arrives, departs) if np.isfinite(t)] if stop in at_of else []
+            plan.time.extend(planned)
+            plan.distance.extend([at_of[stop]] * len(planned) if planned else [])
             if planned and late > LATE_S:
-                at = float(left if np.isfinite(left) else came)
-                panel.annotate(
-                    f"+{late:.0f} s", (at, at_of[stop]), xytext=(3, -3), textcoords="offset points", fontsize=6,
-                    va="top", color=drawn.colour[name], zorder=5, bbox=style.PAPER,
-                )  # fmt: skip
-        if x:
-            panel.plot(
-                x, y, color=drawn.colour[name], linestyle=(0, (4, 2)), linewidth=0.8, marker="o", markersize=3.5,
-                markerfacecolor="white", alpha=0.9, zorder=2, gid="planned",
+                plan.late.append((float(left if np.isfinite(left) else came), at_of[stop], float(late)))
+        if plan.time and str(train) in corridor.distance:
+            found[str(train)] = plan
+    return found
+
+
+def _draw_plans(panel: Axes, corridor: Corridor, drawn: Drawn) -> bool:
+    """Planned times at the stops of a corridor, dashed from stop to stop, and delays beside them; whether there are any."""
+    found = plans(drawn, corridor)
+    for name, plan in found.items():
+        panel.plot(
+            plan.time, plan.distance, color=drawn.colour[name], linestyle=(0, (4, 2)), linewidth=0.8, marker="o", markersize=3.5,
+            markerfacecolor="white", alpha=0.9, zorder=2, gid="planned",
+        )  # fmt: skip
+        for at, place, late in plan.late:
+            panel.annotate(
+                f"+{late:.0f} s", (at, place), xytext=(3, -3), textcoords="offset points", fontsize=6, va="top",
+                color=drawn.colour[name], zorder=5, bbox=style.PAPER,
             )  # fmt: skip
-            some = True
-    return some
+    return bool(found)
+
+
+def numbered_at(distance: Floats, k: int) -> int:
+    """Row at which the number of the k-th train stands on its line; those of trains that run close together one after the other."""
+    some = np.flatnonzero(np.isfinite(distance))
+    way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(distance[some])))])  # where a train stands, marks and places stand too
+    return int(some[np.searchsorted(way, (0.12 + 0.1 * (k % 5)) * way[-1]).clip(0, len(some) - 1)])
 
 
 def _number(panel: Axes, lines: dict[str, tuple[Floats, Floats]], drawn: Drawn) -> None:
@@ -175,9 +192,7 @@ def _number(panel: Axes, lines: dict[str, tuple[Floats, Floats]], drawn: Drawn) 
         some = np.flatnonzero(np.isfinite(y))
         if k % stride or len(some) < 2:
             continue
-        share = 0.12 + 0.1 * (k // stride % 5)  # numbers of trains that run close together stand one after the other
-        way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(y[some])))])  # where a train stands, marks and places stand too
-        here = int(some[np.searchsorted(way, share * way[-1]).clip(0, len(some) - 1)])
+        here = numbered_at(y, k // stride)
         reach = max(1, int(0.01 * len(drawn.instants)))
         a, b = max(here - reach, some[0]), min(here + reach, some[-1])
         ends = np.array([[x[a], y[a]], [x[b], y[b]]])

@@ -17,7 +17,7 @@ from trainctl.runs.series import INSTANT
 from trainctl.signals import Floats
 
 #: Frames at most, and trains times frames at most.
-FRAMES, CELLS = 2500, 150_000
+FRAMES, CELLS = 2500, 100_000
 #: Minimum number of frames, however many trains.
 FEWEST = 300
 #: Events named in the page.

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from html import escape
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from trainctl.citation import works
 from trainctl.errors import InputError
 from trainctl.figures.trains import Drawn, drawable
 from trainctl.metrics.run import DEFINITIONS, SLACK, metrics
@@ -30,14 +33,41 @@ BOUNDS = {
     "coupler_upper_margin_m": ("coupler stroke below its upper bound", "m"),
 }
 
-#: What else the summary names.
-FIGURES = (
-    "formation.settling_s", "formation.final_error_m", "formation.final_speed_error_mps", "traffic.gap_min_m",
-    "traffic.headway_min_s",
-    "traffic.trains_per_hour", "energy.traction_kwh", "energy.net_kwh_per_train_km", "comfort.jerk_max_mps3", "string.l2_gain",
-    "traffic.collisions", "traffic.teleports",
-)  # fmt: skip
+#: What else the summary names: metric -> words, by group.
+FIGURES = {
+    "Formation": {
+        "formation.settling_s": "all links within 1 m from",
+        "formation.last_link_s": "last link at",
+        "formation.final_error_m": "largest spacing error at the last link",
+        "formation.final_speed_error_mps": "largest speed error at the end",
+        "string.l2_gain": "growth of the spacing error from link to link",
+    },
+    "Traffic": {
+        "traffic.gap_min_m": "smallest gap between trains",
+        "traffic.headway_min_s": "shortest headway",
+        "traffic.trains_per_hour": "trains per hour",
+        "traffic.collisions": "collisions that SUMO counted",
+        "traffic.teleports": "trains that SUMO teleported",
+        "punctuality.stop_delay_mean_s": "mean delay at stops",
+        "punctuality.stop_delay_max_s": "largest delay at a stop",
+    },
+    "Energy and comfort": {
+        "energy.traction_kwh": "traction at the wheel",
+        "energy.net_kwh_per_train_km": "net energy per train-km",
+        "comfort.acceleration_min_mps2": "strongest braking",
+        "comfort.jerk_max_mps3": "largest jerk",
+    },
+}
 
+#: When a value is bad, and why.
+BAD: dict[str, tuple[Callable[[float], bool], str]] = {
+    "formation.final_error_m": (lambda v: v > 1.0, "above 1 m"),
+    "string.l2_gain": (lambda v: v > 1.0, "above 1: errors grow"),
+    "traffic.gap_min_m": (lambda v: v < 0.0, "trains overlap"),
+    "traffic.collisions": (lambda v: v > 0, "none is allowed"),
+    "traffic.teleports": (lambda v: v > 0, "none is allowed"),
+    "punctuality.stop_delay_max_s": (lambda v: v > 180.0, "above 3 min"),
+}
 
 #: In place of the animation.
 NO_FILM = (
@@ -46,7 +76,7 @@ NO_FILM = (
 )
 
 
-def report(run: Run, out: Path | str | None = None) -> Path:
+def report(run: Run, out: Path | str | None = None, *, clock: bool = False, kmh: bool = False) -> Path:
     """Write the page of a run.
 
     Parameters
@@ -55,6 +85,10 @@ def report(run: Run, out: Path | str | None = None) -> Path:
         A run folder.
     out : Path, optional
         The file; default ``report.html`` in the run folder.
+    clock : bool
+        Time in hours and minutes of the run.
+    kmh : bool
+        Speeds in km/h.
 
     Returns
     -------
@@ -62,7 +96,7 @@ def report(run: Run, out: Path | str | None = None) -> Path:
         The file.
     """
     path = Path(out) if out is not None else run.folder / "report.html"
-    text = page(run)
+    text = page(run, clock=clock, kmh=kmh)
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
@@ -70,17 +104,18 @@ def report(run: Run, out: Path | str | None = None) -> Path:
     return path
 
 
-def page(run: Run) -> str:
+def page(run: Run, *, clock: bool = False, kmh: bool = False) -> str:
     """The whole page as text."""
     from plotly.offline import get_plotlyjs
 
-    drawn = drawable(run)
+    drawn = drawable(run, clock=clock, kmh=kmh)
     if not drawn.trains.names:
         raise InputError(f"{run.folder}: no train was recorded")
     values = run.metrics if (run.folder / "metrics.json").exists() else metrics(run)
     film = animation(drawn)
     span = [float(drawn.instants[0]), float(drawn.instants[-1])]
     data: dict[str, Any] = {"animation": film, "panels": panels(drawn), "title": drawn.known.title, "span": span}
+    data |= {"clock": drawn.clock, "per_mps": drawn.per_mps, "speed_unit": drawn.speed_unit}
     parts = {
         "title": escape(drawn.known.title or run.folder.name),
         "css": _template("report.css"),
@@ -91,6 +126,8 @@ def page(run: Run) -> str:
         "verdict": _outcome(drawn.run) + _verdict(values, drawn.run) + _not_followed(drawn.run),
         "bounds": _bounds(values),
         "figures": _figures(values),
+        "origin": escape(drawn.origin),
+        "cite": _cited(drawn),
         "events": _events(film),
         "tracks": "On the net" if drawn.known.traffic else "On the tracks",
         "no_film": "" if film["time"] else NO_FILM,
@@ -188,25 +225,57 @@ def _bounds(values: Mapping[str, Any]) -> str:
     rows = []
     for words, unit, margin, whose in _margins(values):
         held = margin >= -SLACK
-        shown = "0" if abs(margin) <= SLACK else f"{margin:.6g}"
+        shown = "0" if abs(margin) <= SLACK else three(margin)
         rows.append(
             f"<tr><th scope=row>{words}</th><td class=n>{shown}</td><td>{unit}</td><td>{escape(whose)}</td>"
-            f'<td class="{"held" if held else "broken"}">{"held" if held else "violated"}</td></tr>'
+            f'<td class="{"held" if held else "broken"}">{"held" if held else "⚠ violated"}</td></tr>'
         )
     return "".join(rows)
 
 
+def three(value: float | str | None) -> str:
+    """A number with three significant digits, no exponent between a thousandth and a million; counts and whole seconds as they are."""
+    if value is None:
+        return "never"
+    if isinstance(value, str):
+        return value
+    if isinstance(value, int) or (float(value).is_integer() and abs(value) < 1e4):
+        return f"{value:.0f}"  # a count, or a time of the run
+    value = float(f"{value:.2e}")
+    if 1e3 <= abs(value) < 1e6:
+        return f"{value:,.0f}".replace(",", "\u2009")
+    if 1e-3 <= abs(value) < 1e3:
+        return f"{value:.{max(0, 2 - int(np.floor(np.log10(abs(value)))))}f}"
+    mantissa, _, power = f"{value:.2e}".partition("e")
+    return f"{mantissa}·10<sup>{int(power)}</sup>"
+
+
 def _figures(values: Mapping[str, Any]) -> str:
+    """Rows of metrics in words, a line per group before its own; bad values are marked, with the reason."""
     rows = []
-    for name in FIGURES:
-        if name in values:
-            value, (unit, words) = values[name], DEFINITIONS.get(name, ("", ""))
-            shown = "never" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+    for group, words in FIGURES.items():
+        found = [name for name in words if name in values]
+        if found:
+            rows.append(f"<tr class=group><th scope=rowgroup colspan=4>{group}</th></tr>")
+        for name in found:
+            value, (unit, definition) = values[name], DEFINITIONS.get(name, ("", ""))
+            rule, reason = BAD.get(name, (lambda v: False, ""))
+            bad = "not by the last link" if value is None else reason if rule(value) else ""
+            mark = f"<td class=broken>⚠ {bad}</td>" if bad else "<td></td>"
+            shown = value if isinstance(value, int | float) or value is None else escape(str(value))
             rows.append(
-                f'<tr><th scope=row title="{escape(words)}">{escape(name)}</th>'
-                f"<td class=n>{escape(shown)}</td><td>{escape(unit)}</td></tr>"
+                f'<tr><th scope=row title="{escape(name)}: {escape(definition)}">{words[name]}</th>'
+                f"<td class=n>{three(shown)}</td><td>{escape(unit) if unit != '1' else ''}</td>{mark}</tr>"
             )
     return "".join(rows)
+
+
+def _cited(drawn: Drawn) -> str:
+    """What to cite with the run, one line each."""
+    versions = drawn.run.info.get("versions", {})
+    found, remarks = works(drawn.known.law, drawn.known.observer or "none", versions, drawn.run.info.get("backend") != "numeric")
+    lines = [work.text() for work in found] + [f"({remark})" for remark in remarks]
+    return "".join(f"<li>{escape(line)}</li>" for line in lines)
 
 
 def _events(found: Mapping[str, Any]) -> str:

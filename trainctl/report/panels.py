@@ -7,12 +7,15 @@ the plotting library reads as they are: 7 digits, 1.6 cm at 200 km.
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from trainctl.figures import style
+from trainctl.figures.corridors import Corridor, Place, corridors, crossovers
+from trainctl.figures.train_graph import NUMBERED, numbered_at, plans
 from trainctl.figures.trains import Drawn, in_formation
 from trainctl.metrics.driving import JOULES_PER_KWH
 from trainctl.metrics.values import at_least, at_most
@@ -23,10 +26,10 @@ Panel = dict[str, Any]
 Trace = dict[str, Any]
 
 #: Points of one panel at most, shared by its lines: a browser draws that many without a stutter.
-POINTS_PER_PANEL = 40_000
+POINTS_PER_PANEL = 30_000
 #: Points of one line: at most, and at least however many lines there are.
 POINTS = (2000, 120)
-#: Dashes of the library per track, in lateral order, as ``style.TRACK_STYLES``.
+#: Dashes of the library per track, by name, as ``style.TRACK_STYLES``.
 DASHES = ("solid", "8px,3px", "2px,3px", "8px,3px,2px,3px")
 #: More different bounds than this in one panel are not drawn.
 BOUNDS = 6
@@ -41,7 +44,14 @@ def panels(drawn: Drawn) -> list[Panel]:
     """All panels that apply to a run, in the order of the page."""
     found = [*_train_graph(drawn), _speeds(drawn), *_spacings(drawn), *_errors(drawn), _inputs(drawn)]
     found += [*_unit_forces(drawn), *_couplers(drawn), *_energy(drawn), *_events(drawn)]
-    return [panel for panel in found if panel["traces"]]
+    for one in found:
+        one["traces"].sort(key=lambda trace: natural(str(trace.get("group", ""))))  # stable: bands stay under their lines
+    return [one for one in found if one["traces"]]
+
+
+def natural(name: str) -> list[tuple[int, int, str]]:
+    """Key to sort names by: their numbers by size."""
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.findall(r"\d+|\D+", name)]
 
 
 def panel(name: str, title: str, unit: str, traces: list[Trace], **more: Any) -> Panel:
@@ -80,10 +90,10 @@ def _train_graph(drawn: Drawn) -> Iterator[Panel]:
     """Time against distance, one dash per track; below, relative to the reference."""
     time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
     if drawn.known.traffic:
-        yield panel("graph", "Train graph", "position [km]", list(_in_and_out(drawn, position / 1000)), note=IN_AND_OUT)
+        yield from _corridors(drawn)
         return
     track = drawn.trains.frame["track"]
-    lateral = [str(name) for name in track.astype("category").cat.categories]
+    tracks = sorted(map(str, track.unique()), key=natural)  # as in the figures
     on = track.astype(str).to_numpy()
     reference = drawn.known.reference
     kinds = [("graph", "Train graph", "position [km]")]
@@ -95,7 +105,7 @@ def _train_graph(drawn: Drawn) -> Iterator[Panel]:
             value = position[rows] / 1000
             if name == "relative" and reference is not None:
                 value = value - leader_over(reference, time[rows])[0] / 1000
-            for k, place in enumerate(lateral):
+            for k, place in enumerate(tracks):
                 here = on[rows] == place
                 if not here.any():
                     continue
@@ -107,9 +117,44 @@ def _train_graph(drawn: Drawn) -> Iterator[Panel]:
                 ))  # fmt: skip
         if reference is not None and name == "graph":
             traces.append(_reference(drawn, leader_over(reference, drawn.instants)[0] / 1000))
-        yield panel(name, title, unit, traces, note="One colour per train, one dash per track." if name == "graph" else "")
+        note = "One colour per train, one dash per track." if name == "graph" else ""
+        here = _places(crossovers(drawn.run, drawn.trains)) if name == "graph" else []
+        yield panel(name, title, unit, traces, note=note, places=here)
 
 
+def _corridors(drawn: Drawn) -> Iterator[Panel]:
+    """One train graph per corridor, with its places by name, train numbers and planned times."""
+    time, rows_of = drawn.trains.column("time_s"), dict(drawn.trains.slices())
+    for number, corridor in enumerate(corridors(drawn.run, drawn.trains)):
+        value = np.full(len(time), np.nan)
+        numbers: list[Trace] = []
+        for k, (name, distance) in enumerate(corridor.distance.items()):
+            value[rows_of[name]] = distance / 1000
+            at = numbered_at(distance, k)
+            numbers.append({
+                "x": [float(time[rows_of[name]][at])], "y": [float(distance[at]) / 1000], "text": [name], "name": name,
+                "color": _colour(drawn, name), "words": True, "group": name,
+            })  # fmt: skip
+        traces = [*_in_and_out(drawn, value), *(numbers if len(numbers) <= NUMBERED else []), *_plans(drawn, corridor)]
+        title = f"Train graph, {corridor.name}" if corridor.name else "Train graph"
+        note = f"{IN_AND_OUT} Rings are planned times." if any("rings" in trace for trace in traces) else IN_AND_OUT
+        yield panel(f"graph{number or ''}", title, "distance [km]", traces, note=note, places=_places(corridor.places))
+
+
+def _plans(drawn: Drawn, corridor: Corridor) -> Iterator[Trace]:
+    for name, (x, y, _) in plans(drawn, corridor).items():
+        yield {
+            "x": x, "y": y, "name": f"train {name}, planned", "color": _colour(drawn, name), "dash": "4px,3px", "rings": True,
+            "group": name,
+        }  # fmt: skip
+
+
+def _places(found: tuple[Place, ...]) -> list[dict[str, Any]]:
+    return [{"value": place.at_m / 1000, "name": place.name, "stop": place.kind == "stop"} for place in found]
+
+
+#: Of panels of links.
+OF_LINKS = "A link has the colour of its train behind."
 #: Of panels of trains that come and go.
 IN_AND_OUT = "Full where the train is in a formation, dotted where it is not; no line where it is not there."
 
@@ -130,15 +175,16 @@ def _in_and_out(drawn: Drawn, value: Floats) -> Iterator[Trace]:
 
 
 def _speeds(drawn: Drawn) -> Panel:
-    speed = drawn.trains.column("speed_mps")
+    factor = drawn.per_mps
+    speed = factor * drawn.trains.column("speed_mps")
     traces = list(_in_and_out(drawn, speed)) if drawn.known.traffic else _of_trains(drawn, speed)
     if drawn.known.reference is not None:
-        traces.append(_reference(drawn, leader_over(drawn.known.reference, drawn.instants)[1]))
-    bounds = _limits(value for pair in drawn.known.speed_mps.values() for value in pair)
+        traces.append(_reference(drawn, factor * leader_over(drawn.known.reference, drawn.instants)[1]))
+    bounds = _limits(factor * value for pair in drawn.known.speed_mps.values() for value in pair)
     if drawn.known.cruise_mps is not None:
-        bounds.append({"value": drawn.known.cruise_mps, "name": "cruising speed", "dash": "dot"})
+        bounds.append({"value": factor * drawn.known.cruise_mps, "name": "cruising speed", "dash": "dot"})
     note = f"{IN_AND_OUT} Bounds are those of trains in formations." if drawn.known.traffic else ""
-    return panel("speeds", "Speeds against bounds", "speed [m/s]", traces, bounds=bounds, note=note)
+    return panel("speeds", "Speeds against bounds", f"speed [{drawn.speed_unit}]", traces, bounds=bounds, note=note)
 
 
 def _inputs(drawn: Drawn) -> Panel:
@@ -163,18 +209,17 @@ def _spacings(drawn: Drawn) -> Iterator[Panel]:
         return
     time, spacing = links.column("time_s"), links.column("spacing_m")
     keys = np.column_stack([links.column(name) for name in ("desired_m", "lower_m", "upper_m")])
-    groups: dict[tuple[float, float, float], list[tuple[int, str, Any]]] = {}
-    for k, (name, rows) in enumerate(links.slices()):
+    groups: dict[tuple[float, float, float], list[tuple[str, str, Any]]] = {}
+    for (_, behind), (name, rows) in zip(links.ends, links.slices(), strict=True):
         kinds, which = np.unique(keys[rows], axis=0, return_inverse=True)
         for j, kind in enumerate(kinds):
-            groups.setdefault(tuple(kind.tolist()), []).append((k, name, np.flatnonzero(which.ravel() == j) + rows.start))
-    colours = style.colours(len(links.names))
+            groups.setdefault(tuple(kind.tolist()), []).append((behind, name, np.flatnonzero(which.ravel() == j) + rows.start))
     shown = sorted(sorted(groups, key=lambda key: -len(groups[key]))[:4])
     for number, key in enumerate(shown):
         desired, lower, upper = key
         traces = [
-            _line(time[rows], spacing[rows] / 1000, f"link {name}", _hex(colours[k]), len(groups[key]), group=name)
-            for k, name, rows in groups[key]
+            _line(time[rows], spacing[rows] / 1000, f"link {name}", _colour(drawn, behind), len(groups[key]), group=behind)
+            for behind, name, rows in groups[key]
         ]
         bounds = _limits([lower / 1000, upper / 1000]) + [{"value": desired / 1000, "name": "desired", "dash": "dot"}]
         title = f"Spacing against bounds, desired {desired / 1000:g} km"
@@ -183,7 +228,14 @@ def _spacings(drawn: Drawn) -> Iterator[Panel]:
             if len(groups) > len(shown)
             else ""
         )
-        yield panel(f"spacing{number or ''}", title, "spacing [km]", traces, bounds=bounds, note=note if number == 0 else "")
+        yield panel(
+            f"spacing{number or ''}",
+            title,
+            "spacing [km]",
+            traces,
+            bounds=bounds,
+            note=f"{OF_LINKS} {note}".strip() if number == 0 else "",
+        )
 
 
 def _errors(drawn: Drawn) -> Iterator[Panel]:
@@ -191,10 +243,9 @@ def _errors(drawn: Drawn) -> Iterator[Panel]:
     if not links.names:
         return
     time, error = links.column("time_s"), np.maximum(np.abs(links.column("error_m")), 1e-9)
-    colours = style.colours(len(links.names))
     traces = [
-        _line(time[rows], error[rows], f"link {name}", _hex(colours[k]), len(links.names), group=name)
-        for k, (name, rows) in enumerate(links.slices())
+        _line(time[rows], error[rows], f"link {name}", _colour(drawn, behind), len(links.names), group=behind)
+        for (_, behind), (name, rows) in zip(links.ends, links.slices(), strict=True)
     ]
     minimum = max(1e-6, float(error.min()))
     high = max(10.0 * minimum, float(error.max()))

@@ -13,8 +13,8 @@ from trainctl.errors import InputError
 from trainctl.figures.trains import drawable
 from trainctl.record.recorder import Recorder, standard_tables
 from trainctl.report.animation import animation, frames
-from trainctl.report.page import page, report
-from trainctl.report.panels import panels, told
+from trainctl.report.page import page, report, three
+from trainctl.report.panels import natural, panels, told
 from trainctl.runs.run import Run
 
 
@@ -38,11 +38,11 @@ def text(run):
 
 def test_page_is_one_file_that_asks_for_nothing(run, text):
     outside = re.sub(r"<script>.*?</script>", "", text, flags=re.S)  # the plotting library names addresses it never uses offline
-    assert re.findall(r'(?:src|href)="([^"#]*)', outside) == ["data:,", ""]  # an empty icon, a place on this page
+    assert re.findall(r'(?:src|href)="([^"#]*)', outside) == ["data:,", "", ""]  # an empty icon, two places on this page
     assert "url(" not in outside
     assert "default-src 'none'" in outside
     assert report(run).read_text(encoding="utf-8") == text
-    assert len(text) < 10e6
+    assert len(text) < 7e6
 
 
 def test_every_panel_is_there_with_its_bounds(run, text):
@@ -100,7 +100,40 @@ def test_verdict_says_what_broke_first_and_where(finished, text):
     assert re.search(
         r"1 of \d kinds of bound violated.</strong> First at 989 s: lower spacing bound \[m\] of link of 4-5", violated
     )
-    assert '<td>4-5</td><td class="broken">violated</td>' in violated
+    assert '<td>4-5</td><td class="broken">⚠ violated</td>' in violated
+
+
+def test_metrics_are_words_with_three_digits_and_bad_ones_are_marked(text):
+    table = text[text.index("<caption>Metrics") : text.index('id="tracks"')]
+    assert re.search(r">Formation</th>.*>Traffic</th>.*>Energy and comfort</th>", table, re.S)
+    (gain,) = re.findall(r"growth of the spacing error.*?</tr>", table)
+    assert re.search(r"class=n>[\d.]{4}<.*⚠ above 1", gain)
+    assert "formation." not in re.sub(r'title="[^"]*"', "", table)  # keys stand in the titles alone
+    shown = [three(v) for v in (0.0999999, 18625.4, 1758.0, 3.0084e-6, 0.0, None, 12.345, 2400000.0, 7)]
+    assert shown == ["0.100", "18\u2009600", "1758", "3.01·10<sup>-6</sup>", "0", "never", "12.3", "2.40·10<sup>6</sup>", "7"]
+
+
+def test_a_page_says_where_it_comes_from_and_what_to_cite(run, text):
+    source = text[text.index('id="source"') : text.index("</main>")]
+    assert f"seed {run.info['seed']}" in source and run.info["scenario_sha256"][:12] in source
+    assert "Fully Distributed Approach" in source
+
+
+def test_lines_stand_by_number_and_a_link_goes_with_its_train_behind(finished):
+    shown = {panel["id"]: panel for panel in panels(drawable(finished("three_tracks", "numeric", **{"run.duration_s": 1100})))}
+    assert sorted(["10", "9", "1.2"], key=natural) == ["1.2", "9", "10"]
+    assert [t["group"] for t in shown["errors"]["traces"]] == ["2", "3", "3", "4", "5", "6", "6"]
+    colour = {t["group"]: t["color"] for t in shown["speeds"]["traces"] if "group" in t}
+    assert all(t["color"] == colour[t["group"]] for t in shown["errors"]["traces"])
+    assert {p["name"] for p in shown["graph"]["places"]} == {"emu_leave", "emu_join"}
+
+
+def test_hours_and_kilometres_per_hour_by_option(run):
+    data = data_of(page(run, clock=True, kmh=True))
+    assert (data["clock"], data["per_mps"], data["speed_unit"]) == (True, 3.6, "km/h")
+    (speeds,) = [panel for panel in data["panels"] if panel["id"] == "speeds"]
+    assert speeds["unit"] == "speed [km/h]"
+    assert [b["value"] for b in speeds["bounds"]] == pytest.approx([284.4, 306.0])
 
 
 def test_lost_messages_are_told_from_missing_links(finished):

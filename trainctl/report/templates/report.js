@@ -18,34 +18,58 @@
   const shown = (color) => (color === "ink" || color === "#000000") ? css("--ink") : (isDark() && color === "#0072B2") ? "#6f86ff" : color;
   const faint = (color) => { const c = shown(color); return c.startsWith("#") && c.length === 7 ? c + "2e" : c; };
 
+  const hidden = new Set(); // trains that are not drawn in any plot
+  const drawn_now = (t) => !(t.group && hidden.has(t.group));
+  const when = (time) => { // a time of the run as words
+    if (!data.clock) return +time.toFixed(3) + " s";
+    const s = Math.round(time), two = (n) => String(n).padStart(2, "0");
+    return `${two(Math.floor(s / 3600))}:${two(Math.floor(s / 60) % 60)}:${two(s % 60)}`;
+  };
+  const narrow = () => innerWidth < 640;
+
   function traces(panel) {
     const many = panel.traces.filter((t) => !t.band).length > 60;
-    return panel.traces.map((t) => t.points
-      ? { type: "scatter", mode: "markers", x: t.x, y: t.y, text: t.text, name: t.name, marker: { color: shown(t.color), size: 9, symbol: "diamond" }, hovertemplate: "%{x:g} s: %{y}<br>%{text}<extra></extra>" }
-      : {
-        type: "scatter", mode: "lines", x: t.x, y: t.y, name: t.name, legendgroup: t.group, connectgaps: false, opacity: t.alpha || 1,
+    return panel.traces.map((t) => {
+      if (t.points) return { type: "scatter", mode: "markers", x: t.x, y: t.y, text: t.text, name: t.name, marker: { color: shown(t.color), size: 9, symbol: "diamond" }, hovertemplate: "%{x:g} s: %{y}<br>%{text}<extra></extra>" };
+      if (t.words) return { type: "scatter", mode: "text", x: t.x, y: t.y, text: t.text.map((w) => `<b>${safe(w)}</b>`), textfont: { color: shown(t.color), size: 11 }, textposition: "top left", hoverinfo: "skip", visible: drawn_now(t) };
+      return {
+        type: "scatter", mode: t.rings ? "lines+markers" : "lines", x: t.x, y: t.y, name: t.name, connectgaps: false, opacity: t.alpha || 1, visible: drawn_now(t),
         line: { color: shown(t.color), width: t.band ? 0 : many ? 0.8 : 1.6, dash: t.dash || "solid", shape: t.step ? "hv" : "linear" },
-        fill: t.fill ? "tonexty" : "none", fillcolor: t.fill ? faint(t.color) : undefined, showlegend: !t.band && !many,
-        hoverinfo: t.band ? "skip" : undefined, hovertemplate: t.band ? undefined : "%{y:.6~g}",
-      });
+        ...(t.rings ? { marker: { symbol: "circle-open", size: 7, color: shown(t.color) } } : {}),
+        fill: t.fill ? "tonexty" : "none", fillcolor: t.fill ? faint(t.color) : undefined,
+        hoverinfo: t.band ? "skip" : undefined, hovertemplate: t.band ? undefined : "<b>%{fullData.name}</b><br>%{y:.5~g} at %{x:.6~g} s<extra></extra>",
+      };
+    });
+  }
+
+  function ticks(span) { // of an axis in hours and minutes
+    const steps = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400], most = narrow() ? 4 : 9;
+    const step = steps.find((s) => (span[1] - span[0]) / s <= most) || 86400, at_ = [];
+    for (let t = Math.ceil(span[0] / step) * step; t <= span[1]; t += step) at_.push(t);
+    return { tickvals: at_, ticktext: at_.map((t) => step < 60 ? when(t) : when(t).slice(0, 5)) };
   }
 
   function layout(panel) {
-    const grid = css("--line"), soft = css("--soft");
-    const bounds = panel.bounds || [];
+    const grid = css("--line"), soft = css("--soft"), small = narrow();
+    const bounds = panel.bounds || [], places = panel.places || [];
     const axis = { gridcolor: grid, zerolinecolor: grid, linecolor: soft, tickcolor: soft };
-    const y = { ...axis, title: { text: panel.unit, standoff: 10 }, exponentformat: "power" };
+    const y = { ...axis, title: { text: small ? undefined : panel.unit, standoff: 8 }, exponentformat: "power" };
     if (panel.log) Object.assign(y, { type: "log", range: panel.log });
-    if (panel.categories) Object.assign(y, { type: "category", title: undefined });
+    if (panel.categories) Object.assign(y, { type: "category", title: undefined, tickfont: { size: 10, color: css("--ink") }, ticklabelposition: small ? "inside" : "outside" });
+    const place_colour = (p) => p.stop ? css("--ink") : soft;
     return {
-      height: panel.categories ? 110 + 30 * panel.traces.length : 320, margin: { l: panel.categories ? 132 : 92, r: 176, t: 30, b: 40 }, modebar: { bgcolor: "rgba(0,0,0,0)", color: soft, activecolor: css("--accent") }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
-      font: { color: css("--ink"), size: 12, family: "system-ui, DejaVu Sans, sans-serif" }, hovermode: panel.categories ? "closest" : "x unified",
-      hoverlabel: { bgcolor: css("--paper"), bordercolor: grid, font: { color: css("--ink") } }, legend: { font: { size: 11 }, itemsizing: "constant", traceorder: "grouped", tracegroupgap: 4 },
-      showlegend: !panel.categories, xaxis: { ...axis, title: { text: "time [s]", standoff: 4 }, range: range.slice(), hoverformat: ".6~g" }, yaxis: y, dragmode: "zoom",
-      shapes: bounds.map((b) => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: b.value, y1: b.value, line: { color: b.dash === "dot" ? css("--ink") : css("--bad"), width: 1.2, dash: b.dash } })),
-      annotations: bounds.map((b) => ({ xref: "paper", x: 1, xanchor: "right", y: b.value, yanchor: "bottom", showarrow: false, text: `${b.name} ${+b.value.toPrecision(6)}`, font: { size: 10, color: b.dash === "dot" ? css("--ink") : css("--bad") } })),
+      // the margins are the same in all plots, so that one moment stands in one column
+      height: panel.categories ? 70 + 26 * panel.traces.length : small ? 260 : 320, margin: { l: small ? 46 : 120, r: 14, t: small ? 8 : 26, b: 40 }, modebar: { bgcolor: "rgba(0,0,0,0)", color: soft, activecolor: css("--accent") }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+      font: { color: css("--ink"), size: small ? 10 : 12, family: "system-ui, DejaVu Sans, sans-serif" }, hovermode: "closest", hoverdistance: -1,
+      hoverlabel: { bgcolor: css("--paper"), bordercolor: grid, font: { color: css("--ink") }, align: "left" },
+      showlegend: false, xaxis: { ...axis, title: { text: data.clock ? "time [h:min]" : "time [s]", standoff: 4 }, range: range.slice(), ...(data.clock ? ticks(range) : {}) }, yaxis: y, dragmode: small ? false : "zoom",
+      shapes: [...bounds.map((b) => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: b.value, y1: b.value, line: { color: b.dash === "dot" ? css("--ink") : css("--bad"), width: 1.2, dash: b.dash } })),
+        ...places.map((p) => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: p.value, y1: p.value, layer: "below", line: { color: place_colour(p), width: p.stop ? 1 : 0.8, dash: p.stop ? "solid" : "dot" } }))],
+      annotations: [...bounds.map((b) => ({ xref: "paper", x: 1, xanchor: "right", y: panel.log ? Math.log10(b.value) : b.value, yanchor: "bottom", showarrow: false, text: `${b.name} ${+b.value.toPrecision(4)}`, font: { size: 10, color: b.dash === "dot" ? css("--ink") : css("--bad") } })),
+        ...places.map((p) => ({ xref: "paper", x: 0, xanchor: "left", y: p.value, yanchor: "bottom", showarrow: false, text: p.stop ? `<b>${safe(p.name)}</b>` : safe(p.name), font: { size: 10, color: place_colour(p) } }))],
     };
   }
+  const safe = (text) => text.replace(/&/g, "&amp;").replace(/</g, "&lt;");
 
   // plotly leaves shapes out of the automatic range: an unseen pair of points at the bounds brings them in
   function anchors(panel) {
@@ -60,7 +84,7 @@
     box.className = "plot"; box.id = "plot-" + panel.id; box.tabIndex = 0; box.setAttribute("role", "group"); box.setAttribute("aria-label", panel.title + ", " + panel.unit);
     box.style.marginLeft = box.style.marginRight = 0;
     const head = document.createElement("figcaption"), title = document.createElement("h3"), note = document.createElement("span");
-    title.textContent = panel.title; note.className = "about"; note.textContent = panel.note || "";
+    title.textContent = panel.title + (panel.unit ? `, ${panel.unit}` : ""); note.className = "about"; note.textContent = panel.note || "";
     head.append(title, note);
     const draw = document.createElement("div"); draw.className = "draw";
     const cursor = document.createElement("div"); cursor.className = "cursor";
@@ -95,7 +119,7 @@
     const low = Math.max(wanted[0], whole[0] - 0.02 * span), high = Math.min(wanted[1], whole[1] + 0.02 * span);
     range = high > low ? [low, high] : whole.slice();
     busy = true;
-    await Promise.all(plots.slice(0, drawn).map((p) => Plotly.relayout(p.draw, { "xaxis.range": range.slice() })));
+    await Promise.all(plots.slice(0, drawn).map((p) => Plotly.relayout(p.draw, { "xaxis.range": range.slice(), ...(data.clock ? { "xaxis.tickvals": ticks(range).tickvals, "xaxis.ticktext": ticks(range).ticktext } : {}) })));
     busy = false;
     cursors();
   }
@@ -106,6 +130,36 @@
     if (wanted && !event.ctrlKey && !event.metaKey) { event.preventDefault(); event.stopPropagation(); show_times(wanted); }
   }
   at("all").addEventListener("click", () => show_times(whole));
+
+  // ---- one legend of trains for all plots -----------------------------------------------------------------------------------------
+  const natural = new Intl.Collator("en", { numeric: true }).compare;
+  const names = data.animation.trains.map((train) => train.name).sort(natural);
+  const chips = new Map();
+  function put_on(wanted) { // draw exactly these trains
+    for (const name of names) {
+      if (wanted.has(name)) hidden.delete(name); else hidden.add(name);
+      chips.get(name).setAttribute("aria-pressed", String(wanted.has(name)));
+    }
+    for (const p of plots.slice(0, drawn)) Plotly.restyle(p.draw, { visible: p.panel.traces.map(drawn_now) }, p.panel.traces.map((_, k) => k));
+  }
+  for (const name of names) {
+    const chip = document.createElement("button"), swatch = document.createElement("i");
+    chip.type = "button"; chip.className = "chip"; chip.dataset.train = name; chip.setAttribute("aria-pressed", "true");
+    swatch.dataset.color = data.animation.trains.find((train) => train.name === name).color;
+    chip.append(swatch, name);
+    const left = () => new Set(names.filter((n) => !hidden.has(n)));
+    chip.addEventListener("click", (event) => {
+      const now_on = left();
+      if (event.shiftKey) { put_on(new Set([name])); return; }
+      if (now_on.has(name)) now_on.delete(name); else now_on.add(name);
+      put_on(now_on);
+    });
+    chip.addEventListener("dblclick", () => put_on(new Set([name])));
+    chips.set(name, chip);
+    at("trains").append(chip);
+  }
+  at("everybody").addEventListener("click", () => put_on(new Set(names)));
+  function swatches() { document.querySelectorAll(".chip i, .swatch").forEach((i) => { i.style.background = shown(i.dataset.color); }); }
 
   function cursors() {
     for (const p of plots.slice(0, drawn)) {
@@ -186,7 +240,7 @@
     const soft = css("--soft"); pen.strokeStyle = soft; pen.fillStyle = soft; pen.lineWidth = 2; pen.textAlign = "left"; pen.font = "12px system-ui, DejaVu Sans, sans-serif";
     pen.beginPath(); pen.moveTo(14, height - 16); pen.lineTo(14 + step * sx, height - 16); pen.stroke();
     pen.fillText((step >= 1000 ? step / 1000 + " km" : step + " m") + (raised > 1 ? `, northwards drawn ${raised.toFixed(1)} times as large` : ""), 22 + step * sx, height - 16);
-    pen.fillStyle = css("--ink"); pen.font = "bold 13px system-ui, DejaVu Sans, sans-serif"; pen.fillText("t = " + +now.toFixed(3) + " s", 8, 16);
+    pen.fillStyle = css("--ink"); pen.font = "bold 13px system-ui, DejaVu Sans, sans-serif"; pen.fillText("t = " + when(now), 8, 16);
   }
 
   function paint(share) {
@@ -253,34 +307,46 @@
       pen.beginPath(); pen.arc(x, y, 7, 0, 7); pen.fill(); pen.stroke();
       if (count <= 30 || +at("zoom").value > 2) {
         pen.fillStyle = ink; pen.font = "bold 13px system-ui, DejaVu Sans, sans-serif"; pen.textAlign = "left"; pen.fillText(train.name, x + 10, y - 9);
-        pen.font = "11px system-ui, DejaVu Sans, sans-serif"; pen.fillStyle = soft; pen.textAlign = "center"; pen.fillText(p.v.toFixed(1) + " m/s", x, y + 16);
+        pen.font = "11px system-ui, DejaVu Sans, sans-serif"; pen.fillStyle = soft; pen.textAlign = "center"; pen.fillText((data.per_mps * p.v).toFixed(1) + " " + data.speed_unit, x, y + 16);
       }
     });
     pen.restore();
     pen.fillStyle = soft; pen.textAlign = "left"; pen.font = "12px system-ui, DejaVu Sans, sans-serif";
     film.tracks.forEach((name, k) => pen.fillText("track " + name, 8, py(k)));
-    pen.fillStyle = ink; pen.font = "bold 13px system-ui, DejaVu Sans, sans-serif"; pen.fillText("t = " + +now.toFixed(3) + " s", 8, 16);
+    pen.fillStyle = ink; pen.font = "bold 13px system-ui, DejaVu Sans, sans-serif"; pen.fillText("t = " + when(now), 8, 16);
     pen.fillStyle = soft; pen.textAlign = "right"; pen.font = "12px system-ui, DejaVu Sans, sans-serif"; pen.fillText("running to the right →", width - 10, 16);
   }
 
-  function tell() { // the same in words
-    const words = [], edges = [], silent = [];
-    for (let k = 0; k < count; k++) {
-      const p = place(k, 0);
-      if (p && map) words.push(`${film.trains[k].name}: ${film.tracks[edges_of[frame * count + k]]}, ${p.v.toFixed(2)} m/s`);
-      else if (p) words.push(`${film.trains[k].name}: ${Number.isInteger(p.side) ? "track " + film.tracks[p.side] : "crossover to track " + film.tracks[p.side > nearest(k) ? Math.ceil(p.side) : Math.floor(p.side)]}, ${(p.x / 1000).toFixed(3)} km, ${p.v.toFixed(2)} m/s`);
-    }
+  // the same as a table: one row per train, by number
+  const rows = new Map();
+  if (filmed) {
+    film.trains.map((_, k) => k).sort((a, b) => natural(film.trains[a].name, film.trains[b].name)).forEach((k) => {
+      const row = document.createElement("tr"), head = document.createElement("th"), swatch = document.createElement("i");
+      row.dataset.train = film.trains[k].name; head.scope = "row"; swatch.dataset.color = film.trains[k].color; swatch.className = "swatch";
+      head.append(swatch, film.trains[k].name); row.append(head);
+      const cells = ["on", "at", "speed", "hears", "lost"].map((name) => { const cell = document.createElement("td"); cell.className = name === "at" || name === "speed" ? "n" : ""; row.append(cell); return cell; });
+      if (map) cells[1].hidden = true;
+      at("rows").append(row); rows.set(k, cells);
+    });
+    if (map) at("at-km").hidden = true;
+    at("speed-unit").textContent = data.speed_unit;
+  }
+  const put = (cell, text) => { if (cell.textContent !== text) cell.textContent = text; };
+  function tell() {
+    const hears = film.trains.map(() => []), lost = film.trains.map(() => []);
     for (let c = 0; c < couples; c++) {
       const state = links[frame * couples + c], [a, b] = film.pairs[c];
-      if (!state) continue;
-      const name = film.trains[a].name + "→" + film.trains[b].name;
-      (state === 2 ? edges : silent).push(name);
+      if (state) (state === 2 ? hears : lost)[b].push(film.trains[a].name);
     }
-    const few = (list) => list.length > 40 ? list.slice(0, 40).join(" · ") + ` and ${list.length - 40} more` : list.join(" · ");
+    for (const [k, [on, km, fast, heard, silent]] of rows) {
+      const p = place(k, 0);
+      put(on, !p ? "not there" : map ? film.tracks[edges_of[frame * count + k]] : Number.isInteger(p.side) ? "track " + film.tracks[p.side] : "crossover to track " + film.tracks[p.side > nearest(k) ? Math.ceil(p.side) : Math.floor(p.side)]);
+      put(km, p && !map ? (p.x / 1000).toFixed(3) : "");
+      put(fast, p ? (data.per_mps * p.v).toFixed(2) : "");
+      put(heard, hears[k].sort(natural).join(", ")); put(silent, lost[k].sort(natural).join(", "));
+    }
     const happened = film.events.filter((e) => Math.abs(e.time - times[frame]) < 1e-6).map((e) => e.kind + (e.text ? " (" + e.text + ")" : ""));
-    at("now").replaceChildren(...[["now-links", "Heard: " + (few(edges) || "nobody") + (silent.length ? "; lost: " + few(silent) : "")], ["now-trains", few(words)], ["now-events", happened.length ? "Now: " + happened.slice(0, 6).join("; ") : ""]].flatMap(([id, text]) => {
-      const span = document.createElement("span"); span.id = id; span.textContent = text; return [span, document.createElement("br")];
-    }));
+    at("now").textContent = happened.length ? "Now: " + happened.slice(0, 6).join("; ") : "";
   }
   function nearest(k) { // the track train k came from
     for (let f = frame; f >= 0; f--) { const s = lateral[f * count + k]; if (Number.isInteger(s)) return s; }
@@ -290,7 +356,7 @@
   function show(wanted) {
     if (!filmed) { cursors(); return; }
     frame = Math.max(0, Math.min(times.length - 1, wanted)); now = times[frame];
-    slider.value = frame; slider.setAttribute("aria-valuetext", +now.toFixed(3) + " s"); at("clock").textContent = +now.toFixed(3) + " s";
+    slider.value = frame; slider.setAttribute("aria-valuetext", when(now)); at("clock").textContent = when(now); at("moment").href = "#t=" + +now.toFixed(3);
     paint(0); tell(); cursors();
   }
   function frame_of(time) { // the last one not after ``time``
@@ -301,6 +367,7 @@
   function go_to_time(time) {
     pause();
     if (filmed) show(frame_of(time)); else { now = time; cursors(); }
+    history.replaceState(null, "", "#t=" + +time.toFixed(3));
   }
   function tick(stamp) {
     if (!playing) return;
@@ -309,7 +376,7 @@
     const before = frame; frame = frame_of(now);
     const gap = times[Math.min(frame + 1, times.length - 1)] - times[frame];
     paint(gap > 0 ? Math.max(0, (now - times[frame]) / gap) : 0);
-    slider.value = frame; at("clock").textContent = now.toFixed(1) + " s";
+    slider.value = frame; at("clock").textContent = data.clock ? when(now) : now.toFixed(1) + " s";
     if (frame !== before) { tell(); cursors(); }
     requestAnimationFrame(tick);
   }
@@ -337,12 +404,18 @@
   });
 
   // ---- light and dark, address, start ------------------------------------------------------------------------------------------
-  function recolour() { if (filmed) paint(0); return redraw().then(cursors); }
+  function recolour() { swatches(); if (filmed) paint(0); return redraw().then(cursors); }
   at("theme").addEventListener("click", () => { document.documentElement.dataset.theme = isDark() ? "light" : "dark"; recolour(); });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolour);
-  addEventListener("resize", () => { if (filmed) paint(0); setTimeout(cursors, 300); });
+  let was_narrow = narrow();
+  addEventListener("resize", () => {
+    if (filmed) paint(0);
+    if (narrow() !== was_narrow) { was_narrow = narrow(); redraw(); }
+    setTimeout(cursors, 300);
+  });
   const from_address = () => { const wanted = /^#t=([\d.]+)$/.exec(location.hash); if (wanted) go_to_time(+wanted[1]); };
   addEventListener("hashchange", from_address);
+  swatches();
   show(0);
   from_address();
   draw_next();
