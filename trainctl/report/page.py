@@ -234,7 +234,7 @@ def _bounds(values: Mapping[str, Any]) -> str:
 
 
 def three(value: float | str | None) -> str:
-    """A number with three significant digits, no exponent between a thousandth and a million; counts and whole seconds as they are."""
+    """A number to three digits, no exponent between a thousandth and a million; counts and whole seconds as they are."""
     if value is None:
         return "never"
     if isinstance(value, str):
