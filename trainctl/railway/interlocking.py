@@ -152,8 +152,8 @@ def request(
                 for key in [key for key, k in passed.items() if key[0] == i and k > row[i]]:
                     found.pop(key, None)
                     passed.pop(key, None)
+            queues = {e: [j for j in queue if (j, e) in joins] for e, queue in queues.items()}
     order = [key for key in order if key in granted]
-    queues = {e: [i for i in queue if (i, e) in joins] for e, queue in queues.items()}
     new = granted.keys() - {(i, e) for i, e, _ in state["stretches"]}
     held, waiting, stuck = Index(zones, trains), Index(zones, trains), Index(zones, trains)
     for key in order:
