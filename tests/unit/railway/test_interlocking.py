@@ -180,6 +180,8 @@ def test_a_train_that_waits_to_enter_keeps_its_turn_at_the_join_and_who_comes_la
     held, said = yard.now(entering=entering)
     assert (held.room[0], held.by[0], held.zone[0]) == (350.0, 1, MERGE.number["m"])
     assert [(d.train, d.by, d.join) for d in said] == [(0, 1, True)]
+    # Unless one that stands keeps it out, which perhaps waits for it.
+    assert np.isinf(yard.now(entering=entering, keeps=np.zeros(3, bool))[0].room[0])
     yard.present[1] = True
     assert np.isinf(yard.now()[0].room).all()  # it has come: the one behind follows
 
