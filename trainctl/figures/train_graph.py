@@ -40,13 +40,24 @@ def train_graph(drawn: Drawn) -> Figure:
     return _coming_and_going(drawn) if drawn.known.traffic else _on_tracks(drawn)
 
 
+def to_reference(drawn: Drawn) -> tuple[Floats, bool]:
+    """Positions of all rows relative to the reference [m]; of a crowd, whether it is one, what each train gained since its start.
+
+    No one tells the lines of a crowd apart where they are, but who gains on whom.
+    """
+    position, reference = drawn.trains.column("position_m"), drawn.known.reference
+    if reference is None:
+        return position, False
+    relative = position - leader_over(reference, drawn.trains.column("time_s"))[0]
+    if len(drawn.trains.names) <= NUMBERED:
+        return relative, False
+    return relative - np.repeat(relative[drawn.trains.first[:-1]], np.diff(drawn.trains.first)), True
+
+
 def _on_tracks(drawn: Drawn) -> Figure:
     reference = drawn.known.reference
     time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
-    relative = position - (0.0 if reference is None else leader_over(reference, time)[0])
-    crowd = reference is not None and len(drawn.trains.names) > NUMBERED
-    if crowd:  # no one tells its lines apart where they are, but who gains on whom
-        relative = relative - np.repeat(relative[drawn.trains.first[:-1]], np.diff(drawn.trains.first))
+    relative, crowd = to_reference(drawn)
     bundle = crowd or (reference is not None and np.ptp(relative) < BUNDLE * np.ptp(position))
     heights = {} if reference is None else {"height_ratios": [1, 2] if bundle else [1, 1]}
     figure, axes = style.panels(1 if reference is None else 2, drawn.width, 60.0, **heights)
