@@ -428,6 +428,9 @@ class Deaf:
         """One event."""
         self.told |= kind == "collision" or (kind == "violation" and fields.get("bound") == "gap_m")
 
+    def call(self, train: int, call: Any, edge: int) -> None:
+        """One stop."""
+
     def write(self, row: Any) -> None:
         """One instant."""
 

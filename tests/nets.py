@@ -18,6 +18,7 @@ import pytest
 
 from sumo_net import LineError
 from sumo_net.build import program
+from trainctl.traffic.files import is_time, seconds
 
 #: A train that can brake and pull with some 1 m/s2.
 TYPE = {
@@ -111,10 +112,7 @@ def traffic(folder: Path, body: str, types: str = EMU, end: int = 9000, begin: i
 def _departs(element: ElementTree.Element) -> float:
     """When a train or the first of a flow departs [s]; what else there is comes before."""
     said = element.get("depart", element.get("begin"))
-    try:
-        return -math.inf if said is None else float(said)
-    except ValueError:  # a mistake that a test wants
-        return -math.inf
+    return seconds(said) if said is not None and is_time(said) else -math.inf  # no time: a mistake that a test wants
 
 
 def flow(name: str, route: str, number: int, period: float, begin: float = 0.0, **more: Any) -> str:

@@ -15,6 +15,7 @@ from trainctl.railway import supervisor
 from trainctl.railway.along import Ahead
 from trainctl.railway.authority import View
 from trainctl.railway.supervisor import Limits, Targets
+from trainctl.record.columns import Call
 from trainctl.scenario.build import open_scenario
 from trainctl.scenario.model import Model
 from trainctl.signals import POSITION, SPEED, Bools, Floats, Formed, Seen
@@ -24,6 +25,10 @@ from trainctl.stages.traffic import Around
 class Told(list[tuple[str, dict[str, Any]]]):
     """A journal of events, as (kind, fields)."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: list[tuple[int, Call, int]] = []
+
     def event(self, time: float, kind: str, **fields: Any) -> None:
         """One event."""
         self.append((kind, {"time_s": time, **fields}))
@@ -31,6 +36,10 @@ class Told(list[tuple[str, dict[str, Any]]]):
     def write(self, row: Any) -> None:
         """One instant; the last one is kept."""
         self.row = row
+
+    def call(self, train: int, call: Call, edge: int) -> None:
+        """One stop; all are kept."""
+        self.calls.append((train, call, edge))
 
     def kinds(self) -> list[tuple[str, str]]:
         """Kind and train of every event."""

@@ -32,7 +32,8 @@ class Work(NamedTuple):
         if self.place:
             fields[_PLACE.get(self.kind, "howpublished")] = self.place
         fields |= {**self.details, "year": str(self.year or ""), "doi": self.doi}
-        lines = [f"  {name} = {{{value}}}," for name, value in fields.items() if value]
+        written = {name: value if name == "doi" else value.replace("&", r"\&") for name, value in fields.items()}  # & parts columns
+        lines = [f"  {name} = {{{value}}}," for name, value in written.items() if value]
         return "\n".join([f"@{self.kind}{{{self.key},", *lines, "}"])
 
     def plain(self) -> dict[str, Any]:
@@ -41,7 +42,7 @@ class Work(NamedTuple):
 
 
 _PLACE = {"article": "journal", "inproceedings": "booktitle", "software": "publisher"}
-_LABELS = {"volume": "vol. ", "number": "no. ", "pages": "pp. ", "version": "version "}
+_LABELS = {"volume": "vol. ", "number": "no. ", "pages": "pp. ", "version": "Version "}
 
 TRAINCTL_AUTHORS = "The trainctl authors"
 TRAINCTL_TITLE = "trainctl: a closed-loop testbed for cooperative train control on rail networks"

@@ -173,7 +173,7 @@ def test_E1_without_rv_in_D1_the_run_leaves_its_bounds():
 
 
 def test_E2_with_l4_of_5_the_printed_sign_does_not_converge(clean):
-    """Printed: xt of train 3 still -920 m at 2500 s (sheet -917); corrected 0.001 m. With l4 = 1 the print is masked."""
+    """Printed: xt of train 3 still -920 m at 2500 s (sheet -917); corrected 0.001 m. With l4 = 1 the misprint does not show."""
     wide = law.Params(head_l4=5.0)
     printed = Example(params=wide, printed_l4=True).run(2500.0)
     assert printed.distances()[1] - 7053.0 == pytest.approx(-920.0, abs=2.0)

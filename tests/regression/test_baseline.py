@@ -197,6 +197,10 @@ def test_traffic_of_a_sumo_configuration_runs_as_it_is(tmp_path: Path) -> None:
     trains = done.trains
     stood = trains[(trains["train"] == "stopping") & (trains["speed_mps"] == 0.0)]
     assert len(stood) >= 40 and stood["position_m"].nunique() == 1
+    (halt,) = (s for s in ElementTree.parse(tmp_path / "run" / "sumo" / "stops.xml").iter("stopinfo"))
+    assert (
+        stood["time_s"].min() <= float(halt.get("started", "nan")) < float(halt.get("ended", "nan")) <= stood["time_s"].max() + 1.0
+    )
     assert not (trains["gap_m"] < 0.0).any() and done.metrics["traffic.collisions"] == 0
     steps = trains.groupby("train", observed=True)["position_m"].diff().dropna()
     assert steps.min() >= 0.0 and steps.max() <= 45.0  # goes on without a jump from edge to edge

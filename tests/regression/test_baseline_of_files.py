@@ -87,6 +87,17 @@ def test_what_moving_block_changes_is_named(folder):
     assert {e["train"]: e["time_s"] for e in found.events if e["kind"] == "arrive"} == pytest.approx(theirs, abs=1.0)
 
 
+def test_trains_that_sumo_draws_otherwise_are_told(folder):
+    flow = '<flow id="f" type="emu" begin="0" end="900" probability="0.02"><route edges="ab bc"/></flow>'
+    found = baseline(folder, flow, "", '<seed value="1"/>', block="moving")
+    theirs = {row["id"] for row in plain(folder, "tripinfo", "--railsignal-moving-block")}
+    ours = {e["train"] for e in found.events if e["kind"] == "depart"}
+    told = [e["message"] for e in found.events if e["kind"] == "sumo_warning" and "not recorded" in e["message"]]
+    assert ours < theirs and len(told) == 1 and told[0].startswith(f"{len(theirs - ours)} trains ")
+    notes = [e["what"] for e in found.events if e["kind"] == "not_followed"]
+    assert "flows f: SUMO draws their trains itself, so none of them is planned for a time" in notes
+
+
 def test_the_types_are_those_of_the_files(folder):
     with pytest.raises(InputError, match=r"controller.train_type: the vTypes of network.sumocfg say so"):
         baseline(folder, *CASES["alone"], train_type="ICE1")

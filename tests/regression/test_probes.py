@@ -7,7 +7,6 @@ cruises, so that little is left to explain: a second or two where a train starts
 from __future__ import annotations
 
 from typing import NamedTuple
-from xml.etree import ElementTree
 
 import nets
 import pandas as pd
@@ -19,7 +18,6 @@ from trainctl.runner import run
 from trainctl.runs.logs import vehicles
 from trainctl.runs.sumo_logs import elements
 from trainctl.scenario.build import open_scenario
-from trainctl.traffic.files import seconds
 
 TYPES = (
     '<vType id="emu" vClass="rail" length="100" maxSpeed="30" accel="0.4" decel="0.5" sigma="0" speedDev="0"/>'
@@ -133,25 +131,19 @@ class Seen(NamedTuple):
     named: list[str]
 
 
-def begins(element: ElementTree.Element) -> float:
-    return -1.0 if element.tag == "route" else seconds(element.get("depart", element.get("begin", "0")))
-
-
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Seen, Seen]:
     """Ours and plain SUMO's."""
     folder = tmp_path_factory.mktemp("probes")
-    nodes, edges, body, more = {}, {}, {}, ""
+    nodes, edges, body, more = {}, {}, "", ""
     for k, (name, probe) in enumerate(PROBES.items()):
         at = NUMBER[name]
         nodes |= {f"{at}{n}": (2000.0 * j, 400.0 * k) for j, n in enumerate("abcd")}
         edges |= {f"{at}{x}{y}": (f"{at}{x}", f"{at}{y}") for x, y in ("ab", "bc", "cd")}
-        body[name] = probe.body.replace("@", at)
+        body += probe.body.replace("@", at)
         more += probe.more.replace("@", at)
     nets.net(folder, nodes, edges)
-    # SUMO takes a route file by departure times.
-    elements_of = sorted(ElementTree.fromstring(f"<r>{''.join(body.values())}</r>"), key=begins)
-    nets.traffic(folder, "".join(ElementTree.tostring(e, "unicode") for e in elements_of), TYPES)
+    nets.traffic(folder, body, TYPES)
     (folder / "m.add.xml").write_text(f"<additional>{more}</additional>")
     cfg = folder / "a.sumocfg"
     cfg.write_text(cfg.read_text().replace("</input>", '<additional-files value="m.add.xml"/></input>'))

@@ -26,7 +26,7 @@ from trainctl.scenario.build import open_scenario
 from trainctl.scenario.model import Model
 
 BIN = Path(sys.executable).parent / "trainctl"
-TABLES = ("trains.parquet", "units.parquet", "links.parquet")
+TABLES = ("trains.parquet", "units.parquet", "links.parquet", "stops.parquet")
 #: EMU units, a train leaves and another joins.
 SCENARIO = ("three_tracks", "-q", "--set", "run.duration_s=1300", "--set", "run.record_every_s=5")
 OURS = (*TABLES, "events.jsonl", "metrics.json", "scenario.toml")

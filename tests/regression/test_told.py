@@ -213,15 +213,16 @@ def test_overspeed_is_told_and_fails_only_where_it_must(tmp_path, typed):
 
 @pytest.fixture(scope="module")
 def circle(tmp_path_factory):
-    """Four long trains round a passing loop, two each way: none can go before the next one has gone."""
+    """A roundabout: who comes in has its turn before who is on it, finds the ring full, and all the others wait for it."""
     folder = tmp_path_factory.mktemp("circle")
-    ways = {
-        "A": ("left up1 middle", 3000),
-        "B": ("up1 middle", 1700),
-        "C": ("-middle down1 -left", 3000),
-        "D": ("down1 -left", 1700),
-    }
-    nets.single_track(folder, "".join(nets.train(n, way, 0, departSpeed=0, departPos=x) for n, (way, x) in ways.items()))
+    ring = {"a": (0, 0), "b": (2000, 0), "c": (2000, 2000), "d": (0, 2000)}
+    outer = {"e": (-2500, 0), "f": (2000, -2500), "g": (4500, 2000), "h": (0, 4500)}
+    edges = {name: tuple(name) for name in ("ab", "bc", "cd", "da", "ea", "fb", "gc", "hd")}
+    nets.net(folder, ring | outer, edges)
+    ways = [("ab bc", 1700), ("bc cd", 1700), ("cd da", 1700), ("da ab", 1700)]
+    ways += [("ea ab", 2300), ("fb bc", 2300), ("gc cd", 2300), ("hd da", 2300)]
+    body = (nets.train("ABCDEFGH"[k], way, 0, departSpeed=0, departPos=x) for k, (way, x) in enumerate(ways))
+    nets.traffic(folder, "".join(body))
     told = nets.scenario(
         "fully_distributed",
         700,

@@ -48,6 +48,8 @@ def test_a_run_tells_of_itself_and_can_be_opened_again(run):
     assert repr(again) == repr(run)
     with pytest.raises(InputError, match="no such directory"):
         trainctl.open(run.folder / "nothing")
+    with pytest.raises(InputError, match="not a run folder: it is a file"):
+        trainctl.open(run.folder / "run.json")
 
 
 def test_mistakes_come_all_at_once():

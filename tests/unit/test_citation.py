@@ -48,6 +48,12 @@ def entries(text):
     return found
 
 
+def test_an_ampersand_does_not_part_columns_in_latex():
+    (fields,) = entries(citation.PAPERS["emu_finite_time"].bibtex()).values()
+    assert fields["journal"] == r"Control Theory \& Applications"
+    assert "Control Theory & Applications" in citation.PAPERS["emu_finite_time"].text()
+
+
 def test_entries_have_what_their_kind_needs():
     for work in [*citation.PAPERS.values(), *citation.OBSERVER_PAPERS.values(), citation.SUMO, citation.trainctl("1.2")]:
         (fields,) = entries(work.bibtex()).values()
@@ -104,7 +110,7 @@ def test_command_prints_text_and_entries(tmp_path, monkeypatch, capsys):
     (folder / "scenario.toml").write_text('[controller]\nlaw = "robust_constrained"\n')
     code, out, _ = typed("cite", str(folder))
     assert code == 0
-    assert "version 0.0.9" in out  # the one that ran
+    assert "Version 0.0.9." in out  # the one that ran
     assert "Qijie Hu, Xinyu Fan, Yue Wei (2024): Robust Constrained Cooperative Control" in out
     assert "https://doi.org/10.3390/math12132003" in out
     assert list(entries(out)) == ["trainctl", "hu_robust_2024", "lopez_sumo_2018"]

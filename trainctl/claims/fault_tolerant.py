@@ -382,7 +382,7 @@ def safety(runs: Runs) -> Iterator[Claim]:
     yield claim(
         f"(37) converges for any l4 > 1/2: largest error of distance at 2500 s, l4 = {L4[0]:g} and {L4[1]:g}, corrected", 0, max(worst.values()), "m",
         max(worst.values()) < 0.01, f"as printed, l4 = 5 leaves {float(printed[np.argmax(np.abs(printed - 7053.0))]) - 7053.0:.0f} m at 1500 s: the sign of l4 beta2 must be plus; with the "
-        "paper's l4 = 1 the print is masked", corrected=True,
+        "paper's l4 = 1 the misprint does not show", corrected=True,
     )  # fmt: skip
     starts = runs.starts
     good = sum(s.inside and s.distance < 1.0 and s.spacing < 1e-5 for s in starts)

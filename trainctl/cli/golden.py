@@ -35,7 +35,10 @@ def register(app: typer.Typer) -> None:
     def make(
         source: Source, golden: Golden, every_s: Annotated[float, typer.Option(help="Time between kept instants [s].")] = 60.0
     ) -> None:
-        """Keep a run or SUMO's logs as a golden: thinned in time, without clocks and paths, compressed."""
+        """Keep a run or SUMO's logs as a golden: thinned in time, without clocks and paths, compressed.
+
+        A golden that is there is replaced, unseen; `trainctl golden update` shows what moves.
+        """
         from trainctl.diff.golden import make_golden
 
         place = make_golden(source, golden, every_s)

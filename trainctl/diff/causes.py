@@ -471,7 +471,7 @@ def _of_column(todo: _Open, name: str) -> list[Finding]:
     amount = "differs"
     if f.largest is not None and f.largest.place.difference is not None:
         most, size = f.largest.place.difference, float(figures["size"].max())
-        amount = f"differs by up to {most:.3g}"
+        amount = f"differs by up to {most:.3g}" if math.isfinite(most) else "differs"
         scatters = np.all(np.abs(figures["sum"]) <= 0.3 * figures["sum_abs"])  # of each train, to both sides
         if f.values >= 10 and scatters and most <= NOISE * size:
             f.cause, amount = "noise", f"scatters within {most:.3g}"

@@ -99,14 +99,16 @@ def told(place: Place) -> str:
     text = f"{value_told(place.a)} -> {value_told(place.b)}"
     if place.difference is None:
         return text
-    tube = f"; tube {value_told(place.lower)} .. {value_told(place.upper)}" if place.lower is not None else ""
-    return f"{text} (by {place.difference:.3g}{tube})"
+    tube = [f"tube {value_told(place.lower)} .. {value_told(place.upper)}"] if place.lower is not None else []
+    by = [f"by {place.difference:.3g}"] if math.isfinite(place.difference) else []  # one of them is no number
+    said = "; ".join(by + tube)
+    return f"{text} ({said})" if said else text
 
 
 def value_told(value: float | str | None) -> str:
     """A value of a log in words."""
     if isinstance(value, float):
-        return f"{value:.10g}"
+        return "no number" if math.isnan(value) else f"{value:.10g}"
     return "nothing" if value in (None, "") else short(str(value))
 
 
@@ -167,6 +169,8 @@ def diff(a: Path | str, b: Path | str, tolerances: Tolerances | None = None) -> 
         if not report.tables and not report.files:
             raise InputError(f"{a}, {b}: neither run folders nor folders with logs of SUMO")
     report.renamed = {old: new for new, old in names.items()}
+    if b.is_dir() and thinned(b) and not thinned(a):
+        _note(report, f"{short(str(b))} is a golden, which holds some instants only: give it first")
     met = {(t.table, c) for t in report.tables for c in t.compared}
     report.notes += [f"tolerance of {name}: no such column was compared" for name in chosen.unused(met)]
     report.notes += [f"{t.table}.{name}: only in B" for t in report.tables for name in t.new_columns]
@@ -187,7 +191,7 @@ def _logs(
         logs.append(log)
     one, two = logs
     if one.name and two.name and one.name != two.name:
-        raise InputError(f"{a} is a {one.name} log, {b} a {two.name} log: they cannot be compared")
+        raise InputError(f"{a} is a log of {one.name}, {b} of {two.name}: they cannot be compared")
     if one.version and two.version and one.version != two.version:
         _note(report, f"SUMO {one.version} -> {two.version}")
     kind = next((k for k in KINDS if k.name == (one.name or two.name or name)), None)

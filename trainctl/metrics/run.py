@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from trainctl.errors import InputError
-from trainctl.metrics import driving, traffic
+from trainctl.metrics import driving, punctuality, traffic
 from trainctl.metrics.values import Values, at_least, at_most, put_worst
 from trainctl.monitors.outcome import GAP
 from trainctl.runs.known import UNBOUNDED, Facts, facts
@@ -63,6 +63,7 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
     "watched.<name>_max": ("as named", "Maximum value over all sub-steps of a quantity that the law constrains."),
     **driving.DEFINITIONS,
     **traffic.DEFINITIONS,
+    **punctuality.DEFINITIONS,
 }  # fmt: skip
 
 
@@ -104,6 +105,8 @@ def metrics(run: Run, *, band_m: float = 1.0, speed_band: float = 0.02, section_
     values |= driving.of_comfort(trains)
     inside = [float(event["value"]) for event in run.events if event["kind"] == "violation" and event.get("bound") == GAP]
     values |= traffic.of_trains(trains, section_m, inside)
+    values |= punctuality.of_entries(run.events)
+    values |= punctuality.of_stops(run.stops, float(time.max()))
     try:
         values |= traffic.of_sumo(run.folder / "sumo")
     except InputError:

@@ -28,7 +28,6 @@ TRIPINFO = {
     "routeLength": "traffic.sumo_route_length_mean_m",
     "waitingTime": "traffic.sumo_waiting_time_mean_s",
     "timeLoss": "traffic.sumo_time_loss_mean_s",
-    "departDelay": "traffic.sumo_depart_delay_mean_s",
 }
 
 DEFINITIONS: dict[str, tuple[str, str]] = {
@@ -51,7 +50,6 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
     TRIPINFO["routeLength"]: ("m", "Mean route length."),
     TRIPINFO["waitingTime"]: ("s", "Mean waiting time (speed below 0.1 m/s)."),
     TRIPINFO["timeLoss"]: ("s", "Mean delay against driving at the allowed speed."),
-    TRIPINFO["departDelay"]: ("s", "Mean delay of the departure."),
     "traffic.collisions": ("1", "Collisions that SUMO counted."),
     "traffic.teleports": ("1", "Vehicles that SUMO teleported."),
     "traffic.emergency_stops": ("1", "Emergency stops that SUMO counted."),
@@ -129,6 +127,8 @@ def of_sumo(folder: Path) -> Values:
     if trips:
         sums, count = dict.fromkeys(TRIPINFO, 0.0), 0
         for _, attributes in elements(trips, "tripinfos", {"tripinfo"}):
+            if _number(trips, attributes, "arrival") < 0.0:  # under way when the run ended
+                continue
             count += 1
             for attribute in sums:
                 sums[attribute] += _number(trips, attributes, attribute)
@@ -196,8 +196,10 @@ def _of_rows(batches: Iterable[pa.Table], path: Path, parked: Mapping[str, Seque
     spacing, headway = _Mean(), _Mean()
     for batch in batches:
         time, speed = batch["time"].to_numpy(), batch["speed"].to_numpy()
-        if np.any(np.diff(time) < 0) or time[0] <= end:
-            raise InputError(f"{path}: time does not ascend near {time[0]:g} s")
+        back = np.flatnonzero(np.diff(time) < 0)
+        if len(back) or time[0] <= end:
+            before, after = (time[back[0]], time[back[0] + 1]) if len(back) else (end, time[0])
+            raise InputError(f"{path}: time does not ascend: {after:.10g} s after {before:.10g} s")
         begin, end = min(begin, float(time[0])), float(time[-1])
         names.update(batch["id"].unique().to_pylist())
         steps += 1 + int(np.count_nonzero(np.diff(time) > INSTANT))

@@ -7,24 +7,24 @@ lies within its reach, and keeps its request until its rear has left or its way 
 at once.
 
 Deadlock: a train is let into a stretch only if behind it, before the next stretch, it finds room to stand with all who will stand
-there, or else together with the next one. While it waits for that, later trains may overtake it; this is the only exception to
-first come, first served.
+there, or else together with the next one; and only if everybody can still get out then, see ``deadlock``. While it waits for that,
+later trains may overtake it; this is the only exception to first come, first served. Nobody enters the net that would overtake so.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable, Sequence
 from typing import NamedTuple, TypedDict
 
 import numpy as np
-from numba import njit
 
-from trainctl.kernels import keep_by_sources
-from trainctl.railway.along import Net, Order
-from trainctl.railway.ways import Ways
+from trainctl.railway import deadlock
+from trainctl.railway.along import Order
+from trainctl.railway.zones import Index, Trains, Zones, coming, near, under
 from trainctl.signals import Bools, Floats, Ints
 
-keep_by_sources()  # before anything below is decorated
+#: A train this near to its own stop is at it [m].
+AT_M = 1e-3
 
 
 class State(TypedDict):
@@ -33,16 +33,6 @@ class State(TypedDict):
     joins: dict[str, list[int]]  # edge number: trains in the order of their turns
     stretches: list[tuple[int, int, bool]]  # train, edge it enters over, granted; in the order of requesting
     until: dict[str, float]  # train number: position up to which it has requested [m]
-
-
-class Zones(NamedTuple):
-    """What is exclusive along every way; to be made anew when ways change. W rows as in ``ways``."""
-
-    ways: Ways
-    net: Net
-    begins: Ints  # (W,) first row of the stretch this row is in, -1: in none
-    ends: Ints  # (W,) last row of it, -1
-    following: Ints  # (W,) first row of the next stretch after this row's, -1: none
 
 
 class Held(NamedTuple):
@@ -68,16 +58,6 @@ def none() -> State:
     return State(joins={}, stretches=[], until={})
 
 
-def zones(ways: Ways, net: Net) -> Zones:
-    """Find the stretches along all ways: edges whose twin, or an edge across them, is on any way as well."""
-    used = np.zeros(len(net.length), bool)
-    used[ways.edge] = True
-    across = np.repeat(np.arange(len(used)), np.diff(net.cross_first))
-    shared = (net.twin >= 0) & used[net.twin]
-    shared |= np.bincount(across, weights=used[net.cross], minlength=len(used)) > 0
-    return Zones(ways, net, *_stretches(ways, shared))
-
-
 def order(state: State) -> Order:
     """Turns at joins as ``along.places`` takes them."""
     turns = [(int(edge), train, turn) for edge, queue in state["joins"].items() for turn, train in enumerate(queue)]
@@ -86,14 +66,15 @@ def order(state: State) -> Order:
 
 def request(
     zones: Zones, state: State, row: Ints, s: Floats, length: Floats, present: Bools, reach: Floats,
-    clearance: float = 0.0, entering: Bools | None = None,
+    clearance: float = 0.0, entering: Bools | None = None, stop: Floats | None = None, stands: Bools | None = None,
+    ordered: Sequence[tuple[int, int, int]] = (),
 ) -> tuple[State, Held, list[Decision]]:  # fmt: skip
     """Requests of all trains at one instant.
 
     Parameters
     ----------
     zones : Zones
-        From ``zones``, of the ways the trains have now.
+        From ``zones.of``, of the ways the trains have now.
     state : State
         Requests so far; left as it is.
     row, s, length, present : ndarray, shape (n,)
@@ -104,6 +85,12 @@ def request(
         Room one standing train needs beyond its length [m].
     entering : ndarray, shape (n,), optional
         Trains that are not on the net yet and ask to be, at ``row`` and ``s``: they may enter once their room is not 0.
+    stop : ndarray, shape (n,), optional
+        Where each train will stand next by its own plan [m], inf if nowhere: what lies well beyond it does not request.
+    stands : ndarray, shape (n,), optional
+        Trains that stand there and are not to go on yet.
+    ordered : sequence of tuple
+        Train, a row of its way, and the train that must have passed there first.
 
     Returns
     -------
@@ -119,25 +106,56 @@ def request(
     A train whose front is in a stretch has it, as a fact. Turns at joins within a stretch come with it, and none beyond a stretch
     that is not granted: else one who waits for the stretch could be first where one who has it must pass. Trains on the way to one
     edge keep the order they stand in, or, where they come over different tracks, the order of their turns at the join.
+
+    A request ends at the train's own stop: who is to stand ``clearance`` or more before a stretch does not request it, and who
+    stands gives back what lies ahead of it, if all can still get out then.
+
+    A train that waits for nothing but a gap to enter keeps its turn at joins, and where it is to enter: whoever comes later over
+    another track waits there until it has come.
     """
-    outside = np.zeros(len(row), bool) if entering is None else entering
-    until = s + reach
-    for train, position in state["until"].items():
-        until[int(train)] = max(until[int(train)], position)
-    on = present | outside
-    at, begin, edge = _near(zones, row, s, length, on, until), zones.ways.begin, zones.ways.edge
+    nobody = np.zeros(len(row), bool)
+    outside, stands = nobody if entering is None else entering, nobody if stands is None else stands
+    begin, edge = zones.ways.begin, zones.ways.edge
+    until = _until(zones, state, row, s, reach, clearance, stop, stands)
+    on, joining = present | outside, zones.net.joins.copy()
+    joining[edge[zones.ways.first[:-1][outside]]] = True
+    at = near(zones, joining, row, s, length, on, outside, until)
     joins: dict[tuple[int, int], int] = {}
     stretches: dict[tuple[int, int], int] = {}
     for i, k, is_join in zip(*(a.tolist() for a in at), strict=True):
         (joins if is_join else stretches).setdefault((i, int(edge[k])), k)
-    trains = _Trains(zones, row, s, length, *_coming(zones, row, present))
+    trains = Trains(zones, row, s, length, *coming(zones, row, present))
+    shut: dict[int, tuple[int, int]] = {}  # first row that a train must leave to another one, and that
+    for i, k, first in ordered:
+        shut[i] = min((k, first), shut.get(i, (k, first)))
+    for i, (k, first) in list(shut.items()):  # those behind it on its track wait with it
+        for (j, e), m in joins.items():
+            if (
+                e == edge[k]
+                and j not in shut
+                and trains.track(j, m) == trains.track(i, k)
+                and trains.distance(j, m) > begin[k] - s[i]
+            ):
+                shut[j] = (m, first)
+    joins = {(i, e): k for (i, e), k in joins.items() if i not in shut or k < shut[i][0]}
 
     queues = {int(e): [i for i in queue if (i, int(e)) in joins] for e, queue in state["joins"].items()}
     leave = {(i, e): g for i, e, g in state["stretches"]}
-    said = _turns(trains, queues, joins, _open(joins, stretches, leave))
+    said = _turns(trains, queues, joins, _open(_inside(joins, outside), stretches, leave), outside)
     order, granted = _queue(trains, state["stretches"], stretches, queues)
+    in_place = _in_place(trains, present, np.flatnonzero(outside).tolist(), clearance)
+    granted |= {key: False for key in order if outside[key[0]]}  # it has its place in the queue only
+    for i in np.flatnonzero(stands & present).tolist():
+        if _gives_back(trains, present, granted, i, clearance, queues, joins, ordered):
+            until[i] = s[i]
+            for passed, found in ((stretches, granted), (joins, joins)):
+                for key in [key for key, k in passed.items() if key[0] == i and k > row[i]]:
+                    found.pop(key, None)
+                    passed.pop(key, None)
+    order = [key for key in order if key in granted]
+    queues = {e: [i for i in queue if (i, e) in joins] for e, queue in queues.items()}
     new = granted.keys() - {(i, e) for i, e, _ in state["stretches"]}
-    held, waiting = _Index(zones, trains), _Index(zones, trains)
+    held, waiting, stuck = Index(zones, trains), Index(zones, trains), Index(zones, trains)
     for key in order:
         if granted[key] or (s[key[0]] > begin[stretches[key]] and not outside[key[0]]):
             if not granted[key]:
@@ -150,6 +168,7 @@ def request(
             _lead(leading, zones, key[0], stretches[key])
     room, zone, by = np.full(len(row), np.inf), np.full(len(row), -1, np.int64), np.full(len(row), -1, np.int64)
     behind: dict[int, int] = {}
+    there = present.copy()  # and whoever is let in
     for key in list(order):
         i, e = key
         k = stretches[key]
@@ -159,6 +178,10 @@ def request(
         blocker = behind.get(e, -1)
         if room[i] < np.inf:  # it does not even have the one before this one
             blocker = int(by[i])
+        elif i in in_place:
+            blocker = in_place[i]
+        elif i in shut and shut[i][0] <= zones.ends[k]:
+            blocker = shut[i][1]
         elif blocker < 0:
             rest, in_front = _needed_too(trains, i, k, clearance, leading, granted, queues)
             later = held.blocker(i, rest)
@@ -167,33 +190,66 @@ def request(
             if blocker < 0:
                 blocker = later if later >= 0 else waiting.blocker(i, rest)
             if blocker >= 0 and later < 0:
-                waiting.add(i, [k, *rest])
+                here = _standing(trains, there, granted, i, (), clearance, queues, joins, ordered)
+                stuck_itself = any(True for _ in deadlock.needs(here, blocker, trains.before(queues)))
+                if not (stuck_itself or _stood_on(here, zones.ends, i, [k, *rest])):
+                    waiting.add(i, [k, *rest])
+            if blocker < 0 and outside[i]:  # nobody comes in before one who waits for the same, whatever for
+                blocker = stuck.blocker(i, [k, *rest])
+            if blocker < 0 and i in shut and rest and shut[i][0] <= zones.ends[rest[-1]]:
+                blocker = shut[i][1]
+            if blocker < 0:
+                here = _standing(trains, there, granted, i, [k, *rest], clearance, queues, joins, ordered)
+                blocker = deadlock.in_a_circle(here, i, trains.before(queues))
         if blocker >= 0:
+            stuck.add(i, [k, *rest])
             behind.setdefault(e, i)
             if key in new:
                 said.append(Decision(i, e, False, blocker, False))
             if begin[k] - s[i] < room[i]:
                 room[i], zone[i], by[i] = max(begin[k] - s[i], 0.0), e, blocker
             continue
+        there[i] = True
         held.add(i, [k, *rest])
         for r in [k, *rest]:
             one = (i, int(edge[r]))
             if one not in granted:
                 order.append(one)
                 stretches[one] = r
-            if not granted.get(one, False):
+            if not leave.get(one, False):
                 said.append(Decision(*one, True, -1, False))
             granted[one] = True
             until[i] = max(until[i], begin[r])
             _lead(leading, zones, i, r)
+        # With it go the turns up to its end, at once: who is let in next comes after it.
+        turns = {(i, int(edge[r])): r for r in _joining(trains, i, k, int(zones.ends[rest[-1] if rest else k]))}
+        joins |= turns
+        said += _turns(trains, queues, joins, turns, outside)
+    for i in np.flatnonzero(outside & (room > 0.0)).tolist():  # perhaps to stand before what it has not
+        blocker = in_place.get(i, -1)
+        if blocker < 0:
+            here = _standing(trains, there, granted, i, (), clearance, queues, joins, ordered)
+            blocker = deadlock.in_a_circle(here, i, trains.before(queues))
+        if blocker >= 0:
+            room[i], zone[i], by[i] = 0.0, edge[row[i]], blocker
+        there[i] |= blocker < 0
     for (i, e), k in stretches.items():
-        if granted[i, e]:  # with it go the turns within it
-            last = int(zones.ends[k])
-            until[i] = max(until[i], begin[last])
-            for r in range(max(k, int(zones.ways.first[i]) + 1), last + 1):
-                if zones.net.joins[edge[r]] and begin[r] > s[i] - length[i]:
-                    joins.setdefault((i, int(edge[r])), r)
-    said += _turns(trains, queues, joins, _open(joins, stretches, granted))
+        if granted[i, e]:
+            until[i] = max(until[i], begin[zones.ends[k]])
+            for r in _joining(trains, i, k, int(zones.ends[k])):
+                joins.setdefault((i, int(edge[r])), r)
+    for i, (k, first) in shut.items():
+        if begin[k] - s[i] < min(reach[i], room[i]) and (present[i] or outside[i]):
+            room[i], zone[i], by[i] = max(begin[k] - s[i], 0.0), edge[k], first
+    barred = outside & (room <= 0.0)
+    queues = {e: [i for i in queue if not barred[i]] for e, queue in queues.items()}
+    said += _turns(trains, queues, joins, _open(_inside(joins, barred), stretches, granted), outside)
+    _keep_places(trains, queues, joins, outside, room, zone, by)
+    after = zones.following[row]
+    for i in np.flatnonzero(present & (after >= 0) & (begin[after] - s < reach)).tolist():  # not requested: it stands before
+        k = _limit(trains, granted, i)
+        if k >= 0 and (i, int(edge[k])) not in granted and begin[k] - s[i] < min(reach[i], room[i]):
+            room[i], zone[i], by[i] = max(begin[k] - s[i], 0.0), edge[k], -1
     now = State(
         joins={str(e): queue for e, queue in queues.items() if queue},
         stretches=[(i, e, granted[i, e]) for i, e in order],
@@ -202,36 +258,120 @@ def request(
     return now, Held(room, zone, by), said
 
 
-class _Trains(NamedTuple):
-    """Where the trains are."""
+def _until(
+    zones: Zones, state: State, row: Ints, s: Floats, reach: Floats, clearance: float, stop: Floats | None, stands: Bools
+) -> Floats:
+    """Position up to which every train requests [m]: its reach, or its own stop, where there is room before what follows."""
+    begin, begins = zones.ways.begin, zones.begins
+    until: Floats = np.where(stands, s, s + reach)
+    if stop is None:
+        stop = np.full(len(s), np.inf)
+    for i in np.flatnonzero((stop > s - AT_M) & (stop < until)).tolist():
+        k = int(row[i])  # of the first stretch that begins at the stop or beyond
+        while k < zones.ways.first[i + 1] and (begins[k] != k or begin[k] < stop[i] - AT_M):
+            k += 1
+        if k == zones.ways.first[i + 1] or begin[k] - stop[i] >= clearance:
+            until[i] = max(stop[i] - AT_M, s[i])
+    for train, position in state["until"].items():
+        until[int(train)] = max(until[int(train)], position)
+    return until
 
-    zones: Zones
-    row: Ints
-    s: Floats
-    length: Floats
-    entry: Ints  # edges over which trains enter their next stretch, ascending
-    comer: Ints  # those trains
 
-    def coming(self, e: int) -> list[int]:
-        """Trains whose next stretch begins with edge ``e``."""
-        found: list[int] = self.comer[np.searchsorted(self.entry, e) : np.searchsorted(self.entry, e, side="right")].tolist()
-        return found
+def _gives_back(
+    trains: Trains, present: Bools, granted: dict[tuple[int, int], bool], i: int, clearance: float, queues: dict[int, list[int]],
+    joins: dict[tuple[int, int], int], ordered: Sequence[tuple[int, int, int]],
+) -> bool:  # fmt: skip
+    """Whether all can still get out if ``i`` does without what lies ahead of it."""
+    ways = trains.zones.ways
+    ahead = {int(e) for e in ways.edge[trains.row[i] + 1 : ways.first[i + 1]]}
+    without = {key: g and not (key[0] == i and key[1] in ahead) for key, g in granted.items()}
+    if without == granted:
+        return True
+    here = _standing(trains, present, without, i, (), clearance, queues, joins, ordered)
+    return deadlock.in_a_circle(here, i, trains.before(queues)) < 0
 
-    def distance(self, i: int, k: int) -> float:
-        return float(self.zones.ways.begin[k] - self.s[i])
 
-    def goes_before(self, i: int, k: int, j: int, m: int, queues: dict[int, list[int]]) -> bool:
-        """Whether ``i`` comes before ``j`` to the edge at their rows k and m, by where they stand or by their turns before it."""
-        edge = self.zones.ways.edge
-        nearer = (self.distance(i, k), i) < (self.distance(j, m), j)
-        while k > self.row[i] and m > self.row[j]:
-            if edge[k - 1] != edge[m - 1]:
-                turns = queues.get(int(edge[k]), [])
-                if i in turns and j in turns:
-                    return turns.index(i) < turns.index(j)
-                return i in turns or (j not in turns and nearer)
-            k, m = k - 1, m - 1
-        return nearer
+def _inside(joins: dict[tuple[int, int], int], without: Bools) -> dict[tuple[int, int], int]:
+    """Those joins that are not of trains ``without``."""
+    return {(i, e): k for (i, e), k in joins.items() if not without[i]}
+
+
+def _keep_places(
+    trains: Trains, queues: dict[int, list[int]], joins: dict[tuple[int, int], int], outside: Bools, room: Floats, zone: Ints,
+    by: Ints,
+) -> None:  # fmt: skip
+    """Hold trains before the joins at which one that is to enter goes first."""
+    for e, queue in queues.items():
+        first: list[int] = []  # of those that are to enter
+        for i in queue:
+            k = joins[i, e]
+            away = trains.distance(i, k)
+            if outside[i]:
+                first.append(i)
+            elif 0.0 <= away < room[i]:
+                before = [j for j in first if trains.track(j, joins[j, e]) != trains.track(i, k)]
+                if before:
+                    room[i], zone[i], by[i] = away, e, before[0]
+
+
+def _limit(trains: Trains, granted: dict[tuple[int, int], bool], i: int, more: Container[tuple[int, int]] = ()) -> int:
+    """First row that a train has not been granted; -1: all is. The stretch its front is in it has, as a fact."""
+    edge, following = trains.zones.ways.edge, trains.zones.following
+    k = int(following[trains.row[i]])
+    while k >= 0 and (granted.get((i, int(edge[k])), False) or (i, int(edge[k])) in more):
+        k = int(following[k])
+    return k
+
+
+def _standing(
+    trains: Trains, on: Bools, granted: dict[tuple[int, int], bool], i: int, rows: Sequence[int], clearance: float,
+    queues: dict[int, list[int]], joins: dict[tuple[int, int], int], ordered: Sequence[tuple[int, int, int]],
+) -> deadlock.Standing:  # fmt: skip
+    """Where all may come to stand if ``i`` gets the stretches at these rows."""
+    zones, begin, edge = trains.zones, trains.zones.ways.begin, trains.zones.ways.edge
+    more = {(i, int(edge[k])) for k in rows}
+    limits = {j: _limit(trains, granted, j, more) for j in {i, *np.flatnonzero(on).tolist()}}
+    turns = [
+        (j, joins[j, e], [m for m in queue[:place] if m in limits and trains.track(m, joins[m, e]) != trains.track(j, joins[j, e])])
+        for e, queue in queues.items()
+        for place, j in enumerate(queue)
+        if j in limits and begin[joins[j, e]] > trains.s[j]
+    ]
+    new = [r for r in _joining(trains, i, rows[0], int(zones.ends[rows[-1]])) if (i, int(edge[r])) not in joins] if rows else []
+    turns += [(i, r, [m for m in queues.get(int(edge[r]), ()) if m in limits]) for r in new]  # it would come last
+    turns += [(j, k, [first]) for j, k, first in ordered if j in limits]
+    return deadlock.standing(
+        zones.ways, zones.net, trains.row, trains.s, trains.length, clearance, limits, turns, trains.before(queues)
+    )
+
+
+def _joining(trains: Trains, i: int, k: int, last: int) -> list[int]:
+    """Rows of joins from row k to ``last`` that the rear of ``i`` has not left."""
+    ways, joins = trains.zones.ways, trains.zones.net.joins
+    rear = trains.s[i] - trains.length[i]
+    return [r for r in range(max(k, int(ways.first[i]) + 1), last + 1) if joins[ways.edge[r]] and ways.begin[r] > rear]
+
+
+def _stood_on(here: deadlock.Standing, ends: Ints, i: int, rows: Iterable[int]) -> bool:
+    """Whether another may come to stand where it shuts the stretches at these rows to ``i``: they do not clear by themselves."""
+    return any(True for k in rows for r in range(k, ends[k] + 1) for _ in deadlock.against(here, i, r))
+
+
+def _in_place(trains: Trains, present: Bools, outside: list[int], clearance: float) -> dict[int, int]:
+    """Trains that are to enter where another one is: which."""
+    ways, row, s, length = trains.zones.ways, trains.row, trains.s, trains.length
+    on: dict[int, list[tuple[int, float]]] = {}
+    for j in np.flatnonzero(present).tolist() if outside else ():
+        for k in under(ways, row, s, length, j):
+            on.setdefault(int(ways.edge[k]), []).append((j, s[j] - ways.begin[k]))
+    found = {}
+    for i in outside:
+        for k in under(ways, row, s, length, i):
+            depth = s[i] - ways.begin[k]
+            for j, other in on.get(int(ways.edge[k]), ()):
+                if other - length[j] < depth + clearance and other > depth - length[i]:
+                    found[i] = j
+    return found
 
 
 def _open(
@@ -246,25 +386,26 @@ def _open(
 
 
 def _turns(
-    trains: _Trains, queues: dict[int, list[int]], near: dict[tuple[int, int], int], new: dict[tuple[int, int], int]
-) -> list[Decision]:
+    trains: Trains, queues: dict[int, list[int]], near: dict[tuple[int, int], int], new: dict[tuple[int, int], int],
+    outside: Bools,
+) -> list[Decision]:  # fmt: skip
     """Put new trains into the queues at joins: last, unless they stand before another from the same track."""
-    edge = trains.zones.ways.edge
     said = []
-    for (i, e), k in sorted(new.items(), key=lambda item: (trains.distance(item[0][0], item[1]), item[0])):
+    # Who is to enter comes after those that perhaps could not wait for it any more.
+    for (i, e), k in sorted(new.items(), key=lambda item: (outside[item[0][0]], trains.distance(item[0][0], item[1]), item[0])):
         queue = queues.setdefault(e, [])
         if i in queue:
             continue
-        same = (t for t, j in enumerate(queue) if edge[near[j, e] - 1] == edge[k - 1])
+        same = (t for t, j in enumerate(queue) if trains.track(j, near[j, e]) == trains.track(i, k))
         turn = next((t for t in same if trains.goes_before(i, k, queue[t], near[queue[t], e], queues)), len(queue))
         queue.insert(turn, i)
-        others = [j for j in queue[:turn] if edge[near[j, e] - 1] != edge[k - 1]]
+        others = [j for j in queue[:turn] if trains.track(j, near[j, e]) != trains.track(i, k)]
         said.append(Decision(i, e, not others, others[-1] if others else -1, True))
     return said
 
 
 def _queue(
-    trains: _Trains, before: Iterable[tuple[int, int, bool]], near: dict[tuple[int, int], int], queues: dict[int, list[int]]
+    trains: Trains, before: Iterable[tuple[int, int, bool]], near: dict[tuple[int, int], int], queues: dict[int, list[int]]
 ) -> tuple[list[tuple[int, int]], dict[tuple[int, int], bool]]:
     """Requests of stretches in order, and whether they are granted; new ones last, unless they go before another over that edge."""
     granted = {(i, e): bool(g) for i, e, g in before if (i, e) in near}
@@ -283,34 +424,6 @@ def _queue(
     return order, granted
 
 
-class _Index:
-    """Which trains request each edge."""
-
-    def __init__(self, zones: Zones, trains: _Trains) -> None:
-        self.zones, self.trains, self.on = zones, trains, dict[int, list[int]]()
-
-    def add(self, i: int, rows: Iterable[int]) -> None:
-        """Put in train ``i`` on what its rear has not left of the stretches that begin at these rows."""
-        ways = self.zones.ways
-        rear = self.trains.s[i] - self.trains.length[i]
-        for k in rows:
-            for r in range(k, self.zones.ends[k] + 1):
-                if ways.begin[r] + self.zones.net.length[ways.edge[r]] > rear:
-                    self.on.setdefault(int(ways.edge[r]), []).append(i)
-
-    def blocker(self, i: int, rows: Iterable[int]) -> int:
-        """A train that requests the twin of, or what is across, an edge of the stretches of ``i`` at these rows; -1: none."""
-        net, edge = self.zones.net, self.zones.ways.edge
-        for k in rows:
-            for r in range(k, self.zones.ends[k] + 1):
-                e = int(edge[r])
-                for f in (int(net.twin[e]), *net.cross[net.cross_first[e] : net.cross_first[e + 1]].tolist()):
-                    for j in self.on.get(f, ()):
-                        if j != i:
-                            return j
-        return -1
-
-
 def _lead(leading: dict[int, set[int]], zones: Zones, i: int, k: int) -> None:
     """Note that train ``i`` was let into the stretch at row k, under the edge over which it enters the one after it."""
     after = zones.following[k]
@@ -318,17 +431,8 @@ def _lead(leading: dict[int, set[int]], zones: Zones, i: int, k: int) -> None:
         leading.setdefault(int(zones.ways.edge[after]), set()).add(i)
 
 
-def _coming(zones: Zones, row: Ints, present: Bools) -> tuple[Ints, Ints]:
-    """Edges over which trains enter their next stretch, ascending, and those trains."""
-    train = np.flatnonzero(present)
-    train = train[zones.following[row[train]] >= 0]
-    entry = zones.ways.edge[zones.following[row[train]]]
-    by_edge = np.argsort(entry, kind="stable")
-    return entry[by_edge], train[by_edge]
-
-
 def _needed_too(
-    trains: _Trains, i: int, k: int, clearance: float, leading: dict[int, set[int]], granted: dict[tuple[int, int], bool],
+    trains: Trains, i: int, k: int, clearance: float, leading: dict[int, set[int]], granted: dict[tuple[int, int], bool],
     queues: dict[int, list[int]],
 ) -> tuple[list[int], int]:  # fmt: skip
     """First rows of the stretches ``i`` needs together with that of row k, since it could not stand between them.
@@ -354,51 +458,3 @@ def _needed_too(
                 return found, j
         k = after
     return found, -1
-
-
-@njit(cache=True)
-def _stretches(ways: Ways, shared: Bools) -> tuple[Ints, Ints, Ints]:
-    """First and last row of every row's stretch, and the first row of the next one, shape (W,) each; -1: none."""
-    count = len(ways.edge)
-    begins, ends, following = np.full(count, -1, np.int64), np.full(count, -1, np.int64), np.full(count, -1, np.int64)
-    for i in range(len(ways.first) - 1):
-        for k in range(ways.first[i], ways.first[i + 1]):
-            if shared[ways.edge[k]]:
-                begins[k] = begins[k - 1] if k > ways.first[i] and begins[k - 1] >= 0 else k
-        for k in range(ways.first[i + 1] - 2, ways.first[i] - 1, -1):
-            following[k] = begins[k + 1] if begins[k + 1] == k + 1 else following[k + 1]
-        for k in range(ways.first[i + 1] - 1, ways.first[i] - 1, -1):
-            if begins[k] >= 0:
-                more = k + 1 < ways.first[i + 1] and begins[k + 1] >= 0
-                ends[k] = ends[k + 1] if more else k
-    return begins, ends, following
-
-
-@njit(cache=True)
-def _near(zones: Zones, row: Ints, s: Floats, length: Floats, on: Bools, until: Floats) -> tuple[Ints, Ints, Bools]:
-    """What every train has to request, from its rear up to ``until``: train, row, whether it is a join (or a stretch)."""
-    ways, net, begins = zones.ways, zones.net, zones.begins
-    count = 0
-    for again in range(2):
-        if again:
-            train, at, is_join = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.bool_)
-        count = 0
-        for i in range(len(row)):
-            if not on[i]:
-                continue
-            rear, first = s[i] - length[i], ways.first[i]
-            back = row[i]
-            while back > first and ways.begin[back] > rear:
-                back -= 1
-            for k in range(back, ways.first[i + 1]):
-                if k > row[i] and ways.begin[k] > until[i]:
-                    break
-                if begins[k] >= 0 and (k == back or begins[k] == k):
-                    if again:
-                        train[count], at[count], is_join[count] = i, begins[k], False
-                    count += 1
-                if k > first and net.joins[ways.edge[k]] and ways.begin[k] > rear:
-                    if again:
-                        train[count], at[count], is_join[count] = i, k, True
-                    count += 1
-    return train, at, is_join

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from trainctl.scenario.roster import Stop
 from trainctl.signals import POSITION, SPEED, Consists, Extremes, Floats, Row
 
 
@@ -31,6 +32,31 @@ class Units(NamedTuple):
     force: Floats  # (U,) N, NaN at the end
     extremes: Extremes
 
+
+class Call(NamedTuple):
+    """A train at one of its stops."""
+
+    stop: Stop
+    number: int  # from 1, along the way of the train
+    arrival: float  # s, NaN: not yet
+    departure: float  # s, NaN: not yet
+
+
+#: stops.parquet, one row per train and stop: value, unit and meaning; ``train``, ``stop`` and ``platform`` come before them.
+STOPS: dict[str, tuple[Callable[[Call], float], str, str]] = {
+    "number": (lambda call: call.number, "1", "Number of the stop on the train's way, from 1."),
+    "planned_arrival_s": (lambda call: call.stop.planned, "s", "SUMO's `arrival`; missing: none is planned."),
+    "arrival_s": (lambda call: call.arrival, "s", "When the train stood, or passed a waypoint; missing: it did not come."),
+    "planned_departure_s": (
+        lambda call: call.stop.until if np.isfinite(call.stop.until) else np.nan, "s",
+        "SUMO's `until`, before which the train does not leave; missing: none is planned.",
+    ),
+    "departure_s": (lambda call: call.departure, "s", "When it began to leave; missing: it did not."),
+    "delay_s": (
+        lambda call: call.stop.late(call.arrival, call.departure), "s",
+        "Departure after the planned one; after the planned arrival where no departure is planned, or the train has not left.",
+    ),
+}  # fmt: skip
 
 #: trains.parquet, values (n,); ``saturated`` comes behind them.
 TRAINS: dict[str, Callable[[Trains], Floats]] = {

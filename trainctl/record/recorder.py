@@ -54,6 +54,7 @@ def standard_tables(
     edges: Sequence[str],
     *,
     units: bool = True,
+    stops: Sequence[str] = (),
     watched: Sequence[str] = (),
     train_extras: Sequence[str] = (),
     unit_extras: Sequence[str] = (),
@@ -66,6 +67,8 @@ def standard_tables(
         The names that the codes in ``train`` (``sender``, ``receiver``), ``track`` and ``edge`` stand for.
     units : bool
         Whether there is a units table.
+    stops : sequence of str
+        Names of the places at which trains stop; none: no stops table.
     watched : sequence of str
         The law's ``WATCHED``: each gives two columns of trains, ``<watched>_min`` and ``<watched>_max``.
     train_extras, unit_extras : sequence of str
@@ -83,6 +86,11 @@ def standard_tables(
             **_floats(columns.LINKS), "heard": "bool",
         },
     }  # fmt: skip
+    if stops:
+        tables["stops"] = {
+            "train": trains, "stop": stops, "platform": edges, "number": "int",
+            **_floats(name for name in columns.STOPS if name != "number"),
+        }  # fmt: skip
     if units:
         tables["units"] = {"time_s": "float", "train": trains, "unit": "int", **_floats((*columns.UNITS, *unit_extras))}
     return tables

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from trainctl.errors import InputError
 from trainctl.runs.run import Run
 
-TABLES = ("trains", "units", "links")
+TABLES = ("trains", "units", "links", "stops")
 
 #: How text begins that a spreadsheet would compute.
 FORMULA = r"^[=+\-@\t\r]"

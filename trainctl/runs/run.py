@@ -40,7 +40,7 @@ class Run:
     def __init__(self, folder: Path | str) -> None:
         self.folder = Path(folder)
         if not self.folder.is_dir():
-            raise InputError(f"{folder}: no such directory")
+            raise InputError(f"{folder}: {'not a run folder: it is a file' if self.folder.exists() else 'no such directory'}")
         if not (self.folder / INFO).is_file():
             raise InputError(f"{folder}: not a run folder: it has no {INFO}")
         info = _json(self.folder / INFO)
@@ -80,6 +80,11 @@ class Run:
     def links(self) -> pd.DataFrame:
         """One row per step and link."""
         return self.table("links")
+
+    @cached_property
+    def stops(self) -> pd.DataFrame:
+        """One row per train and stop; empty if no train stops."""
+        return self.table("stops", missing_is_empty=True)
 
     @cached_property
     def events(self) -> list[dict[str, Any]]:

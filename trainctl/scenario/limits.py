@@ -83,7 +83,7 @@ def differing(scenario: Scenario, plant: Plant, params: Any) -> list[str]:
                 acts = float(_tighter(key).reduce(list(values.values())))
                 who = "train" if len(trains) == 1 else "trains"
                 places = ", ".join(f"{v:g} in {place}" for place, v in values.items())
-                found.append(f"{key} of {who} {', '.join(trains)} = {acts:g}: the tighter acts of {places}")
+                found.append(f"{key} of {who} {', '.join(trains)} = {acts:g}: {places}; the tightest acts")
     return found
 
 

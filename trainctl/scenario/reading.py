@@ -21,6 +21,9 @@ from trainctl.errors import InputError
 from trainctl.scenario.reference import FORMS
 from trainctl.scenario.tables import Scenario
 
+#: Letters of a list that a mistake shows whole.
+SHOWN = 60
+
 
 def shipped() -> dict[str, Path]:
     """Scenarios that come with the package: name -> file."""
@@ -228,9 +231,17 @@ def mistakes(error: ValidationError, data: dict[str, Any], under: str = "", mode
             rule = str(e["ctx"]["error"]) if "ctx" in e else e["msg"]
             lines += [f"{key}: {r}" for r in rule.split("; ")] if "; " in rule and "=" in rule else [f"{key}: {rule}"]
         else:
-            shown = value if not isinstance(value, dict | list) else "..."
-            lines.append(f"{key} = {shown}: {e['msg'][0].lower()}{e['msg'][1:]}")
+            lines.append(f"{key} = {_shown(value, e['type'])}: {e['msg'][0].lower()}{e['msg'][1:]}")
     return list(dict.fromkeys(lines))
+
+
+def _shown(value: Any, mistake: str) -> str:
+    """A value as it stands in the file, as far as that is short; a text in its quotes where they are the mistake."""
+    if isinstance(value, list) and len(text := str(value)) <= SHOWN and "{" not in text:
+        return text.replace("'", '"')
+    if isinstance(value, dict | list):
+        return "..."
+    return f'"{value}"' if isinstance(value, str) and mistake in ("float_type", "int_type", "bool_type") else str(value)
 
 
 _UNION_MEMBERS = {"int", "str", "float", "constrained-int", "constrained-float"}

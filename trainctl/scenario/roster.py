@@ -14,6 +14,7 @@ import numpy as np
 from sumo_net import Line, LineError, Rails
 from sumo_net.layout import Gradient
 from trainctl.errors import InputError
+from trainctl.scenario import passages
 from trainctl.scenario.tables import Scenario, TrafficTable, Train, TrainType
 from trainctl.scenario.train_types import fitted, train_type
 from trainctl.signals import Bools, Floats, Ints
@@ -38,6 +39,13 @@ class Stop(NamedTuple):
     parks: bool = False  # it leaves the track meanwhile, and others pass
     lots: float = math.inf  # so many trains can park at the places of this name
     waits_before: float = 0.0  # m, where a train waits that finds none
+    planned: float = math.nan  # s, arrival; NaN: none is planned
+    edge: str = ""  # the platform: where it stands
+
+    def late(self, arrival: float, departure: float = math.nan) -> float:
+        """How long after the plan a train leaves [s], or comes, where no departure is planned or none has been; NaN: no plan."""
+        leaves = departure - self.until
+        return leaves if math.isfinite(leaves) else arrival - self.planned
 
 
 class Roster(NamedTuple):
@@ -179,6 +187,11 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
                               traffic.kinds[d.kind].max_speed_mps, share * float(rails.speed_mps[way[0]])),
             )
         )  # fmt: skip
+    if not found:
+        found += passages.mistakes(
+            scenario.order, dict(zip(ids, routes, strict=True)),
+            {rails.edges[e]: rails.edges[f] for e, f in enumerate(rails.twin.tolist()) if f >= 0},
+        )  # fmt: skip
     if found:
         raise InputError(list(dict.fromkeys(found)))
     departures = traffic.departures
@@ -263,9 +276,10 @@ def _stops(departure: Departure, rails: Rails, way: Ints, begin: Floats, begin_s
             raise ValueError(f"stop on edge {stop.edge} at {stop.position_m:g} m: lies behind the departure or the stop before")
         row, last = row + int(ahead[0]), stop.position_m
         until = -math.inf if stop.until_s is None else stop.until_s - begin_s
-        area = () if stop.area is None else (float(stop.area.lots), stop.area.depth_m)
-        place = float(begin[row] + stop.position_m)
-        found.append(Stop(place, stop.duration_s, until, stop.name or stop.edge, stop.pass_mps, stop.parks, *area))
+        planned = math.nan if stop.arrival_s is None else stop.arrival_s - begin_s
+        lots, depth = (math.inf, 0.0) if stop.area is None else (float(stop.area.lots), stop.area.depth_m)
+        place, name = float(begin[row] + stop.position_m), stop.name or stop.edge
+        found.append(Stop(place, stop.duration_s, until, name, stop.pass_mps, stop.parks, lots, depth, planned, stop.edge))
     return tuple(found)
 
 
@@ -275,6 +289,8 @@ def _changes(scenario: Scenario, traffic: Configuration) -> tuple[str, ...]:
     found = [f"option step-length = {traffic.step_s:g}: run.step_s = {step:g} instead"] if traffic.step_s != step else []
     if block != "files":
         found.append(f"option railsignal-moving-block: controller.block = {block} instead")
+    if traffic.drawn:
+        found.append(f"flows {', '.join(traffic.drawn[:8])}: SUMO draws their trains itself, so none of them is planned for a time")
     return (*found, "options time-to-teleport and collision.action: trains are never teleported, none is removed that collides")
 
 

@@ -296,6 +296,21 @@ class Event(Table):
         return self
 
 
+class Order(Table):
+    """[[order]]: in which order trains pass an edge, whoever is there first."""
+
+    edge: str = Field(description="Edge of the net; an order holds on the same track in the other direction, too.")
+    trains: tuple[Id, ...] = Field(min_length=2, description="The trains, the first one first; others may pass between them.")
+
+    @field_validator("trains")
+    @classmethod
+    def _once(cls, trains: tuple[Id, ...]) -> tuple[Id, ...]:
+        twice = sorted(i for i, count in Counter(trains).items() if count > 1)
+        if twice:
+            raise ValueError(f"{', '.join(twice)} stands more than once")
+        return trains
+
+
 class Module(Table):
     """A table whose further keys belong to the module it names."""
 
@@ -349,6 +364,7 @@ class Scenario(Table):
     train: tuple[Train, ...] = ()
     link: tuple[Link, ...] = ()
     event: tuple[Event, ...] = ()
+    order: tuple[Order, ...] = ()
     disturbance: tuple[Disturbance, ...] = ()
     fault: tuple[Fault, ...] = ()
 
@@ -402,6 +418,8 @@ class Scenario(Table):
             found += [] if self.train_type else ["train_type: missing; there must be a [train_type.NAME] for the trains"]
             if self.traffic is not None:
                 found.append("traffic: only with network.sumocfg; the trains of [[train]] are in formations from the start")
+            if self.order:
+                found.append("order: only with network.sumocfg; the trains of [[train]] keep the order they are placed in")
             return found
         found = [
             f"{key}: not with network.sumocfg, whose {what}"

@@ -43,8 +43,9 @@ class Journal:
         self.extras = p.plant.COLUMNS
         self.disturbances = DISTURBANCES if p.scenario.disturbance else ()
         self.formed = p.driven
+        self.stops = tuple(dict.fromkeys(stop.name for stops in p.roster.stops for stop in stops)) if p.driven else ()
         tables = standard_tables(
-            p.scenario.ids, p.line.track_ids, p.line.edges, units=self.has_units, watched=watched,
+            p.scenario.ids, p.line.track_ids, p.line.edges, units=self.has_units, watched=watched, stops=self.stops,
             train_extras=(
                 *(ENERGIES if self.has_energies else ()), *self.disturbances, *(("in_formation",) if self.formed else ()),
             ),
@@ -105,6 +106,11 @@ class Journal:
         further = {f"{name}_min": finite(x.watched_min[:, q]) for q, name in enumerate(self.watched)}
         further |= {f"{name}_max": finite(x.watched_max[:, q]) for q, name in enumerate(self.watched)}
         return further
+
+    def call(self, train: int, call: columns.Call, edge: int) -> None:
+        """One row of the stops: a train that has left one, or that comes no more before the end of the run."""
+        numbers = {name: value(call) for name, (value, _, _) in columns.STOPS.items()}
+        self.recorder.write("stops", train=[train], stop=self.stops.index(call.stop.name), platform=edge, **numbers)
 
     def close(self) -> None:
         """Complete the files."""

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from trainctl.monitors import waiting
-from trainctl.railway import along, authority, interlocking, signs, supervisor
+from trainctl.railway import along, authority, interlocking, signs, supervisor, zones
 from trainctl.railway.authority import DRIVER_MARGIN_M, View
 from trainctl.railway.interlocking import Held
 from trainctl.railway.ways import Ways, moved
 from trainctl.railway.ways import ways as laid
+from trainctl.record.columns import Call
 from trainctl.scenario.model import Model
 from trainctl.scenario.roster import Stop
 from trainctl.signals import Bools, Floats, Ints, Seen
@@ -32,9 +34,12 @@ class State(NamedTuple):
     """What the traffic has come to, shape (n,)."""
 
     came: Bools
+    entering: Bools  # they come with the step to this instant, told when they are there
     left: Bools
     next_stop: Ints  # number of it in the roster
-    stands_until: Floats  # s, while a train stands at a stop, else NaN
+    stands_since: Floats  # s, while a train stands at a stop, else NaN
+    stands_until: Floats  # s, the same
+    late: Floats  # s, by how much a train was late where that was known last, NaN: not yet
     stopping: Bools  # for its next stop
     parked: Bools  # off the track, at a stop
     waits_for: Ints  # train that each is held by at a switch, -1 if none
@@ -54,7 +59,7 @@ class State(NamedTuple):
 class Around(NamedTuple):
     """What this instant's traffic means to the trains."""
 
-    entries: tuple[tuple[int, float], ...]  # trains that come now, with their speeds [m/s]
+    entries: tuple[tuple[int, float], ...]  # trains that come with the coming step, with their speeds [m/s]
     stops: tuple[Ints, Floats]  # trains with a stop ahead, and the room to it [m]
     soon: Bools  # (n,) they stop soon
     held: Held | None  # how far each may go before a place that is another's; None: nobody asks
@@ -67,6 +72,11 @@ def nothing(trains: int) -> Around:
     return Around((), (np.zeros(0, np.int64), np.zeros(0)), np.zeros(trains, bool), None, {}, None)
 
 
+def _late(delay: float) -> dict[str, float]:
+    """What an event says of a ``delay`` [s]; nothing where nothing was planned."""
+    return {} if np.isnan(delay) else {"delay_s": round(delay, 9)}
+
+
 class Traffic:
     """The traffic of a run."""
 
@@ -76,11 +86,16 @@ class Traffic:
         self.step_s, self.theta = p.scenario.run.step_s, p.step_theta
         self.net, self.length = along.net(p.rails), p.consists.train_length()
         self.stops_of = np.array([len(stops) for stops in p.roster.stops], np.int64)
-        self.looks = p.looks_ahead
+        self.looks, self.join_range_m = p.looks_ahead, p.driving.join_range_m if p.driven else 0.0
         planned = min(
             p.supervision.emergency_mps2, p.supervision.service_mps2, *([p.driving.deceleration_mps2] if p.driven else [])
         )
         self.requesting = np.minimum(p.assumed.braking, planned)  # what is requested for, and braked with at least
+        number = {name: i for i, name in enumerate(p.scenario.ids)}
+        # Pairs of trains that pass an edge one after the other: edge, who goes first, who comes next.
+        self.pairs = [
+            (p.rails.index[order.edge], number[a], number[b]) for order in p.scenario.order for a, b in pairwise(order.trains)
+        ]
         self.ways: Ways | None = None
         self._limits(0.0)
         routes = [[p.line.index[e] for e in route] for route in p.roster.routes]
@@ -90,8 +105,9 @@ class Traffic:
         """Before the run: trains that are placed have come."""
         n = len(self.length)
         return State(
-            came=np.full(n, self.roster.placed), left=np.zeros(n, bool), next_stop=np.zeros(n, np.int64),
-            stands_until=np.full(n, np.nan), stopping=np.zeros(n, bool), parked=np.zeros(n, bool),
+            came=np.full(n, self.roster.placed), entering=np.zeros(n, bool), left=np.zeros(n, bool),
+            next_stop=np.zeros(n, np.int64), stands_since=np.full(n, np.nan), stands_until=np.full(n, np.nan),
+            late=np.full(n, np.nan), stopping=np.zeros(n, bool), parked=np.zeros(n, bool),
             waits_for=np.full(n, -1), requests=interlocking.none(),
         )  # fmt: skip
 
@@ -100,9 +116,10 @@ class Traffic:
     ) -> tuple[State, Around]:
         """Arrivals, stops, entries; ``overrun`` (n,) is how much farther trains run than their brakes promise [m].
 
-        ``speed`` (n,) gets the speeds of trains that enter; at the ``last`` instant of a run nobody does.
+        Who is due at the end of the coming step is let in now, and is there then: in time. ``speed`` (n,) gets the speeds of trains
+        that enter; at the ``last`` instant of a run nobody does.
         """
-        s = self.arrivals(t, seen, s)
+        s = self.departures(t, seen, speed, self.arrivals(t, seen, s))
         if not self.looks:
             return s, nothing(len(speed))
         self._limits(t)
@@ -114,7 +131,10 @@ class Traffic:
         for i in [] if s.came.all() else np.flatnonzero(~s.came & self._given_up(t) & ~self._given_up(t - self.step_s)).tolist():
             self.journal.event(t, "given_up", train=self.p.scenario.ids[i], planned_s=float(self.roster.depart[i]))
         s, stops, soon = self._stops(t, seen, speed, overrun, s)
-        asking, reach = [] if last else [*self._returning(t, s), *self.due(t, s)], self._reach(speed)
+        later = t + self.step_s
+        if last:
+            self._uncalled(s)
+        asking, reach = [] if last else [*self._returning(later, s), *self.due(later, s)], self._reach(speed)
         s, held, entries, kept_out = self.entering(t, ways, s.on_track(seen), speed, s, asking, reach)
         present = s.on_track(seen).present.copy()
         present[[i for i, _ in entries]] = True
@@ -129,11 +149,23 @@ class Traffic:
         if not gone.any():
             return s
         for i in np.flatnonzero(gone).tolist():
-            self.journal.event(t, "arrive", train=self.p.scenario.ids[i])
+            self.journal.event(t, "arrive", train=self.p.scenario.ids[i], **_late(float(s.late[i])))
         return s._replace(left=s.left | gone)
 
+    def departures(self, t: float, seen: Seen, speed: Floats, s: State) -> State:
+        """Trains that are there for the first time."""
+        there = s.entering & seen.present
+        if not there.any():
+            return s
+        for i in np.flatnonzero(there).tolist():
+            planned = float(self.roster.depart[i])
+            self.journal.event(
+                t, "depart", train=self.p.scenario.ids[i], planned_s=planned, delay_s=t - planned, speed_mps=float(speed[i])
+            )  # fmt: skip
+        return s._replace(entering=s.entering & ~there)
+
     def due(self, t: float, s: State) -> list[int]:
-        """Trains that are to come now: of each edge the first that waits there."""
+        """Trains that are to come at ``t``: of each edge the first that waits there."""
         if s.came.all():
             return []
         first: dict[int, int] = {}
@@ -159,7 +191,9 @@ class Traffic:
         asking[due] = True
         s, held = self._request(t, ways, here, self._reach(speed) if reach is None else reach, asking, s)
         s = s._replace(parked=s.parked.copy(), stands_until=s.stands_until.copy())
-        present, came, come, kept_out = here.present.copy(), s.came.copy(), [], {}
+        present, came, entering = here.present.copy(), s.came.copy(), s.entering.copy()
+        come: list[tuple[int, float]] = []
+        kept_out: dict[int, int] = {}
         for i in due:
             if held.room[i] <= 0.0:
                 continue
@@ -175,11 +209,9 @@ class Traffic:
             if v is None:
                 kept_out[i] = waiting.kept_out(view, i)
                 continue
-            came[i], speed[i] = True, v
-            planned = float(self.roster.depart[i])
-            self.journal.event(t, "depart", train=self.p.scenario.ids[i], planned_s=planned, delay_s=t - planned, speed_mps=v)
+            came[i], entering[i], speed[i] = True, True, v
             come.append((i, v))
-        return s._replace(came=came), held, tuple(come), kept_out
+        return s._replace(came=came, entering=entering), held, tuple(come), kept_out
 
     def _entering_speed(self, i: int, ways: Ways, here: Seen, speed: Floats, view: View, s: State) -> float | None:
         """Speed with which a train can enter safely; None if it has to wait. ``view`` is that with the train at its place."""
@@ -216,9 +248,9 @@ class Traffic:
         behind = view.targets.other == i
         if not behind.any():
             return False
-        asked = authority.of(view.targets, behind)
-        seen = supervisor.verdict(
-            self.rules, trial, asked, supervisor.no_limits(), self.step_s, self.theta, self.assumed, np.zeros(len(speed))
+        asked, clear = authority.of(view.targets, behind), authority.of(view.clear, view.clear.other == i)
+        seen = authority.judge(
+            self.rules, trial, asked, clear, supervisor.no_limits(), self.step_s, self.theta, self.assumed, np.zeros(len(speed))
         )
         return bool(np.any(seen.emergency[view.targets.train[behind]]))
 
@@ -264,7 +296,8 @@ class Traffic:
             return s, nothing(n).stops, np.zeros(n, bool)
         standing = s.standing
         s = s._replace(
-            next_stop=s.next_stop.copy(), stands_until=s.stands_until.copy(), stopping=s.stopping.copy(), parked=s.parked.copy()
+            next_stop=s.next_stop.copy(), stands_since=s.stands_since.copy(), stands_until=s.stands_until.copy(),
+            late=s.late.copy(), stopping=s.stopping.copy(), parked=s.parked.copy(),
         )  # fmt: skip
         for i in np.flatnonzero(seen.present & (s.next_stop < self.stops_of)).tolist():
             stop = self.stop_of(i, s)
@@ -279,26 +312,28 @@ class Traffic:
             if standing[i]:
                 if t < s.stands_until[i] - 1e-9 or s.parked[i]:
                     continue
-                s.stands_until[i] = np.nan
-                s.next_stop[i] += 1
-                self.journal.event(t, "stop_left", train=self.p.scenario.ids[i], stop=stop.name)
+                late = self._called(i, stop, float(s.stands_since[i]), t, int(seen.edge[i]), s)
+                self.journal.event(t, "stop_left", train=self.p.scenario.ids[i], stop=stop.name, **_late(late))
+                s.stands_since[i] = s.stands_until[i] = np.nan
                 stop = self.stop_of(i, s)
                 if stop is None:
                     s.stopping[i] = False
                     continue
                 room = self._place(stop, s) - float(seen.position[i])
             while stop is not None and stop.passing and room <= 0.0:
-                self.journal.event(t, "waypoint", train=self.p.scenario.ids[i], stop=stop.name, speed_mps=float(speed[i]))
-                s.next_stop[i] += 1
+                late = self._called(i, stop, t, t, int(seen.edge[i]), s)
+                self.journal.event(
+                    t, "waypoint", train=self.p.scenario.ids[i], stop=stop.name, speed_mps=float(speed[i]), **_late(late)
+                )  # fmt: skip
                 stop = self.stop_of(i, s)
                 room = stop.place - float(seen.position[i]) if stop is not None else np.inf
             if stop is None:
                 s.stopping[i] = False
                 continue
             if not stop.passing and speed[i] < STANDS_MPS and room < STOP_BAND_M and not self._full(stop, s):
-                s.stands_until[i] = max(t + stop.duration, stop.until)
-                parks = {"parked": True} if stop.parks else {}
-                self.journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=room, **parks)
+                s.stands_since[i], s.stands_until[i] = t, max(t + stop.duration, stop.until)
+                more = _late(t - stop.planned) | ({"parked": True} if stop.parks else {})
+                self.journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=room, **more)
                 s.parked[i] = stop.parks
                 continue
             trains.append(i)
@@ -311,6 +346,21 @@ class Traffic:
         soon[found] = room_to < braking + SOON_S * speed[found]
         stopping = (s.stopping & seen.present | near) & (near | s.standing)
         return s._replace(stopping=stopping), (found, room_to), soon | near
+
+    def _called(self, i: int, stop: Stop, arrival: float, departure: float, edge: int, s: State) -> float:
+        """Record a stop that is done with, and turn to the next; how late the train is [s], NaN: nothing was planned."""
+        self.journal.call(i, Call(stop, int(s.next_stop[i]) + 1, arrival, departure), edge)
+        s.next_stop[i] += 1
+        late = stop.late(arrival, departure)
+        s.late[i] = s.late[i] if np.isnan(late) else late
+        return late
+
+    def _uncalled(self, s: State) -> None:
+        """Record the stops that trains have not left when the run ends."""
+        for i, stops in enumerate(self.roster.stops):
+            for k in range(int(s.next_stop[i]), len(stops)):
+                here = float(s.stands_since[i]) if k == s.next_stop[i] else np.nan
+                self.journal.call(i, Call(stops[k], k + 1, here, np.nan), self.p.rails.index[stops[k].edge])
 
     # Turns, and what is ahead
 
@@ -327,13 +377,36 @@ class Traffic:
         braking = supervisor.stopping_distance(v, self.requesting, self.step_s, self.theta)
         return braking + 4.0 * v * self.step_s + rules.margin_m + 2.0 * DRIVER_MARGIN_M + 50.0 + 6.0 * assumed.uncertainty
 
+    def _own_stops(self, s: State) -> Floats:
+        """Where every train is to stand next [m], shape (n,); inf: nowhere."""
+        places = np.full(len(self.length), np.inf)
+        for i in np.flatnonzero(s.came & ~s.left & (s.next_stop < self.stops_of)).tolist():
+            stop = self.stop_of(i, s)
+            places[i] = np.inf if stop is None or stop.passing else stop.place
+        return places
+
+    def _ordered(self, t: float, ways: Ways, seen: Seen, s: State) -> list[tuple[int, int, int]]:
+        """Trains that must let another one pass an edge first: train, row of the edge in its way, the other one."""
+        found = []
+        for edge, first, then in self.pairs:
+            here = [edge] if self.net.twin[edge] < 0 else [edge, self.net.twin[edge]]
+            rows = [
+                ways.first[i] + np.flatnonzero(np.isin(ways.edge[ways.first[i] : ways.first[i + 1]], here)) for i in (first, then)
+            ]
+            if not all(map(len, rows)) or s.left[first] or (not s.came[first] and self._given_up(t)[first]):
+                continue
+            if not (s.came[first] and seen.row[first] >= rows[0][0]) and not (s.came[then] and seen.row[then] >= rows[1][0]):
+                found.append((then, int(rows[1][0]), first))
+        return found
+
     def _request(self, t: float, ways: Ways, seen: Seen, reach: Floats, entering: Bools, s: State) -> tuple[State, Held]:
         """Let every train request what lies within its reach; ``entering`` (n,) are those that ask to enter the net."""
         if self.ways is not ways:  # they changed
-            self.ways, self.zones = ways, interlocking.zones(ways, self.net)
+            self.ways, self.zones = ways, zones.of(ways, self.net)
         requests, held, said = interlocking.request(
             self.zones, s.requests, seen.row, seen.position, self.length, seen.present, reach,
-            self.p.supervision.margin_m + DRIVER_MARGIN_M, entering,
+            self.p.supervision.margin_m + DRIVER_MARGIN_M, entering, self._own_stops(s), s.standing,
+            self._ordered(t, ways, seen, s),
         )  # fmt: skip
         ids, edges = self.p.scenario.ids, self.p.rails.edges
         for one in said:
@@ -348,9 +421,7 @@ class Traffic:
 
     def _look(self, ways: Ways, seen: Seen, speed: Floats, held: Held, s: State, reach: Floats) -> View:
         """What is ahead of every train."""
-        horizon = float(np.max(reach, where=seen.present, initial=0.0)) + 1000.0
-        if self.p.driven:
-            horizon = max(horizon, self.p.driving.join_range_m)
+        horizon = max(float(np.max(reach, where=seen.present, initial=0.0)) + 1000.0, self.join_range_m)
         return authority.look(
             ways, self.net, self.limit, self.roster.speed_factor, seen.row, seen.position, speed, self.length,
             seen.present, horizon, held.room, interlocking.order(s.requests),

@@ -11,12 +11,13 @@ from typing import Any
 import libsumo
 import numpy as np
 
+from sumo_net.netfile import RAIL
 from trainctl.errors import CouplingError, InputError, SimulatorError
 from trainctl.railway.ways import rerouted, ways
 from trainctl.scenario.model import Model
 from trainctl.signals import Bools, Floats, Ints, Observed, Seen
 from trainctl.sumo.baseline_files import departures, verify_signals, write_configuration, write_own_configuration, write_routes
-from trainctl.sumo.session import TOLERANCE_M, Session
+from trainctl.sumo.session import LOGS, TOLERANCE_M, Session
 
 #: How far ahead SUMO is asked for the next train on a net [m].
 LOOK_M = 20_000.0
@@ -46,6 +47,8 @@ class Baseline(Session):
         verify_signals(p)
         self.p, self.ids = p, p.scenario.ids
         self.departures = departures(p) if p.placed else []
+        if any(p.roster.stops):
+            self.logs = LOGS | {"stop-output": "stops.xml"}
         self.number = {name: i for i, name in enumerate(self.ids)}
         self.length = p.consists.train_length()
         self.track = np.array([line.track_ids.index(t) for t in line.tracks], np.int64)
@@ -57,6 +60,7 @@ class Baseline(Session):
         )
         self.stops = ("",) * len(self.ids)
         self.since = 0.0  # s, when SUMO begins
+        self.others: dict[str, str] = {}  # vClass of who runs beside the trains that are known
         self.seen = Seen(position, self.ways.edge[row], row, there)  # where they will come
 
     @property
@@ -95,7 +99,11 @@ class Baseline(Session):
 
     def messages(self) -> list[tuple[float | None, str]]:
         """As of ``World``."""
-        return [(None if at is None else at - self.since, text) for at, text in super().messages()]
+        found = [(None if at is None else at - self.since, text) for at, text in super().messages()]
+        if trains := [name for name, vclass in self.others.items() if vclass in RAIL]:
+            some = f"{', '.join(trains[:8])}{' ...' if len(trains) > 8 else ''}"
+            found.append((None, f"{len(trains)} trains that SUMO draws otherwise than duarouter are not recorded: {some}"))
+        return found
 
     def collisions(self) -> list[dict[str, Any]]:
         """As of ``World``."""
@@ -104,7 +112,11 @@ class Baseline(Session):
     def _read(self) -> None:
         """Where SUMO has the trains."""
         n, vehicle = len(self.ids), libsumo.vehicle
-        there = [name for name in vehicle.getIDList() if name in self.number]  # no road vehicles
+        everybody = vehicle.getIDList()
+        there = [name for name in everybody if name in self.number]
+        self.others |= {
+            name: vehicle.getVehicleClass(name) for name in everybody if name not in self.number and name not in self.others
+        }
         position, row, present = self.seen.position.copy(), self.seen.row.copy(), np.zeros(n, bool)
         self.speed: Floats = np.full(n, np.nan)
         stops = [""] * n

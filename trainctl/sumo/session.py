@@ -11,7 +11,7 @@ import os
 import re
 import sys
 from collections import deque
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -172,6 +172,7 @@ class Session:
     """
 
     api: Any = libsumo
+    logs: Mapping[str, str] = LOGS
     ids: Sequence[str]
     ways: Ways
     seen: Seen
@@ -192,7 +193,7 @@ class Session:
 
     def _begin(self, configuration: Path) -> None:
         """Start SUMO, which then has its first trains on the net."""
-        logs = [part for key, name in LOGS.items() for part in (f"--{key}", str(self.folder / name))]
+        logs = [part for key, name in self.logs.items() for part in (f"--{key}", str(self.folder / name))]
         self._call(self._launch, ["-c", str(configuration), *logs])
         self.began = True
         self._call(self.api.simulationStep)
@@ -209,7 +210,7 @@ class Session:
         if self.began:
             self.began = False
             self.api.close()
-            torn = [name for key, name in LOGS.items() if key != "log" and not _ended(self.folder / name)]
+            torn = [name for key, name in self.logs.items() if key != "log" and not _ended(self.folder / name)]
             if torn:
                 raise SimulatorError(f"SUMO left {', '.join(torn)} incomplete without a word: is the disk full?")
 

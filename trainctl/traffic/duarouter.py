@@ -27,7 +27,7 @@ _TRAIN_KEYS = {
 #: What it needs of a route.
 _ROUTE_KEYS = {"id", "edges", "probability", "repeat", "cycleTime", "refId"}
 #: What it needs of a stop.
-_STOP_KEYS = {"lane", "edge", "startPos", "endPos", "friendlyPos", "duration", "until", "speed", "parking", *PLACES}
+_STOP_KEYS = {"lane", "edge", "startPos", "endPos", "friendlyPos", "duration", "until", "arrival", "speed", "parking", *PLACES}
 
 
 def expand(

@@ -92,8 +92,8 @@ ELEMENTS: Mapping[str, frozenset[str]] = {
     "routeDistribution": _words("id routes probabilities last"),
     "vTypeDistribution": _words("id vTypes probabilities"),
     "stop": _words(
-        "lane edge startPos endPos friendlyPos duration until ended trainStop busStop containerStop parkingArea chargingStation",
-        "overheadWireSegment speed",
+        "lane edge startPos endPos friendlyPos duration until arrival ended trainStop busStop containerStop parkingArea",
+        "chargingStation overheadWireSegment speed",
     ),
     "vType": _words(
         "id vClass length maxSpeed speedFactor probability carFollowModel trainType mass maxPower maxTraction resCoef_constant",
@@ -115,7 +115,7 @@ OF_NO_EFFECT: Mapping[str, frozenset[str]] = {
     "flow": _drawn,
     "route": _words("color cost period savings exitTimes type"),
     "stop": _words(
-        "line tripId actType color name arrival posLat permitted expected expectedContainers",
+        "line tripId actType color name posLat permitted expected expectedContainers",
     ),
     "vType": _words(
         "color width height guiShape imgFile osgFile emissionClass carriageLength locomotiveLength carriageGap personCapacity",

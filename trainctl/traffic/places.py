@@ -105,6 +105,8 @@ def place_of(stop: Element, elements: Elements, tracks: Tracks) -> Place:
     # A duration below 0 is none.
     said_wrong = [] if is_time(stop.get("duration", "0")) else [f"duration = {stop.get('duration')}"]
     said_wrong += [f"until = {stop.get('until')}"] if bad_time(stop.get("until", "0")) else []
+    arrival = stop.get("arrival", "0")
+    said_wrong += [] if is_time(arrival) else [f"arrival = {arrival}"]
     said_wrong += [f"speed = {stop.get('speed')}"] if bad_number(stop.get("speed")) else []
     try:
         position = float(where.get("endPos", length))

@@ -33,7 +33,7 @@ from trainctl.traffic.files import (
     seconds,
 )
 from trainctl.traffic.kinds import Kind, default_types, kind_of
-from trainctl.traffic.places import YES, Area, Tracks, area_of, off_route, place_of, read_tracks, unconnected, unmarked
+from trainctl.traffic.places import YES, Area, Place, Tracks, area_of, off_route, place_of, read_tracks, unconnected, unmarked
 from trainctl.traffic.scale import scaled
 from trainctl.traffic.speed_signs import Change, speed_signs
 from trainctl.traffic.trial import in_doubt, tried
@@ -64,6 +64,7 @@ class StopElement(NamedTuple):
     pass_mps: float  # it does not stand, but passes with at most this speed; 0: it stands
     parks: bool  # it leaves the track meanwhile
     area: Area | None  # where others park too
+    arrival_s: float | None  # planned
 
 
 class Departure(NamedTuple):
@@ -94,6 +95,7 @@ class Configuration(NamedTuple):
     notes: tuple[str, ...]  # what is not followed
     signs: tuple[Change, ...]  # variable speed signs
     closings: tuple[Closing, ...]
+    drawn: tuple[str, ...]  # flows whose departures are drawn
 
 
 def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, seed: int = 42) -> Configuration:
@@ -209,6 +211,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         notes=(*notes, *more_notes),
         signs=tuple(signs),
         closings=tuple(closed),
+        drawn=tuple(t.get("id", "") for t in trains if "probability" in t.attrib or t.get("period", "").startswith("exp")),
     )
 
 
@@ -278,9 +281,14 @@ def _departure(
     first, end = (0, len(edges) * laps) if isinstance(cut, str) else cut
     firsts = [max(k // of_lap * len(edges) - first, 0) if k < laps * of_lap else 0 for k, _ in enumerate(vehicle.iter("stop"))]
     edges = (edges * laps)[first:end]
-    places = [place_of(stop, elements, tracks) for stop in vehicle.iter("stop")]
+    given = list(vehicle.iter("stop"))
+    places = [place_of(stop, elements, tracks) for stop in given]
+    # duarouter counts ``until`` at stops of a named route from the departure, as SUMO does, but not ``arrival``.
+    late = float(vehicle.get("depart", "0")) if source.get("route") else 0.0
+    planned = [_planned(stop, late if k < of_lap else 0.0 if k >= laps * of_lap else None) for k, stop in enumerate(given)]
     wrong = [f"train {name}: {m}" for m in (*unconnected(list(edges), tracks), *off_route(edges, places, firsts))]
     wrong += [f"train {name}: {cut}"] if isinstance(cut, str) else []
+    wrong += [f"train {name}: {m}" for m in (_backwards(given, planned, places) if laps == 1 else [])]
     stops = [
         StopElement(
             edge=place.lane.rpartition("_")[0],
@@ -292,8 +300,9 @@ def _departure(
             pass_mps=float(stop.get("speed", "0")),
             parks=stop.get("parking", "false").lower() in YES or stop.get("parkingArea") is not None,
             area=area_of(elements.places[stop.get("parkingArea", "")], place) if stop.get("parkingArea") else None,
+            arrival_s=arrival,
         )
-        for stop, place, at in zip(vehicle.iter("stop"), places, firsts, strict=True)
+        for stop, place, at, arrival in zip(given, places, firsts, planned, strict=True)
     ]
     departure = Departure(
         id=name,
@@ -337,6 +346,28 @@ def _departure(
         speed_mps = 0.0
     like = speed if speed in ("avg", "last") else ""
     return departure._replace(position_m=position, arrival_m=arrival_m, speed_mps=speed_mps, like=like), wrong
+
+
+def _planned(stop: Element, late: float | None) -> float | None:
+    """Planned arrival at a stop [s], ``late`` more than its file says; None if it has none, or none in this lap."""
+    said = stop.get("arrival")
+    return seconds(said) + late if said is not None and late is not None and is_time(said) and seconds(said) >= 0 else None
+
+
+def _backwards(stops: list[Element], arrivals: list[float | None], places: list[Place]) -> list[str]:
+    """Mistakes in a timetable: planned times that lie before an earlier one on the way."""
+    wrong, last = [], 0.0
+    for stop, arrival, place in zip(stops, arrivals, places, strict=True):
+        said = stop.get("until", "-1")
+        until = seconds(said) if is_time(said) else -1.0
+        for key, planned in (("arrival", arrival), ("until", until if until >= 0 else None)):
+            if planned is not None and planned < last:
+                edge = place.lane.rpartition("_")[0]
+                wrong.append(
+                    f"stop on edge {edge}: {key} = {planned:g} s: must not be before {last:g} s, planned earlier on its way"
+                )
+            last = max(last, planned or 0.0)
+    return wrong
 
 
 def _depart_position(said: str, length: float, first: float, departure: Departure) -> float:

@@ -11,9 +11,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from trainctl.diff.findings import short
 from trainctl.diff.golden import accept
 from trainctl.diff.rows import compare
-from trainctl.diff.runs import EXACT, Tolerances
+from trainctl.diff.runs import EXACT, Tolerances, diff
 from trainctl.diff.sources import Log
 from trainctl.errors import InputError
 from trainctl.runs.run import Run
@@ -57,6 +58,13 @@ def test_a_change_at_a_kept_instant_is_located(run, golden, tmp_path):
         assert_run_matches(altered(run, tmp_path / "b", 20.0, "4"), golden)
     assert_run_matches(altered(run, tmp_path / "c", 20.0, "4"), golden, {"columns": {"speed_mps": 0.011}})
     assert_run_matches(altered(run, tmp_path / "d", 21.0, "4"), golden)
+
+
+def test_a_golden_given_second_is_told(run, golden):
+    assert diff(golden, run.folder).notes == []
+    assert [note for note in diff(run.folder, golden).notes if "golden" in note] == [
+        f"{short(str(golden))} is a golden, which holds some instants only: give it first"
+    ]
 
 
 def test_rows_that_are_missing_at_a_kept_instant_are_told(run, golden, tmp_path):

@@ -12,7 +12,7 @@ import pytest
 from trainctl.diff.behind import rows_behind
 from trainctl.diff.page import page
 from trainctl.diff.results import github, junit
-from trainctl.diff.runs import diff
+from trainctl.diff.runs import diff, told
 from trainctl.diff.tolerance import parse_tolerances
 from trainctl.errors import InputError
 
@@ -70,9 +70,9 @@ CASES = {
     "an empty id": (BASE.replace(' id="a"', ' id=""'), ['train a is called ""']),
     "3000 attributes": (BASE.replace("<vehicle ", "<vehicle " + " ".join(f'k{k}="1"' for k in range(3000)) + " ", 1), "more than 1000"),
     "a document type": ('<!DOCTYPE x [<!ENTITY a "b">]>' + BASE, "has a document type or entities"),
-    "no number": (BASE.replace('speed="20.00"', 'speed="nan"'), ["speed of train a differs by up to inf from 0 s on"]),
+    "no number": (BASE.replace('speed="20.00"', 'speed="nan"'), ["speed of train a differs from 0 s on"]),
     "a word": (BASE.replace('speed="20.00"', 'speed="fast"'), ["speed of train a differs from 0 s on"]),
-    "a number beyond all": (BASE.replace('x="100.00"', 'x="1e400"', 1), ["x of train a differs by up to inf from 0 s on"]),
+    "a number beyond all": (BASE.replace('x="100.00"', 'x="1e400"', 1), ["x of train a differs from 0 s on"]),
     "numbers whose difference is beyond all": (BASE.replace('x="300.00"', 'x="-1e308"').replace('x="320.00"', 'x="1e308"'),
                                                ["x of train a differs by up to 1e+308 from 10 s on"]),
     "a time that is a word": (BASE.replace('time="3.00"', 'time="three"'), "time = three: must be a time in seconds"),
@@ -118,6 +118,24 @@ def test_an_odd_log_is_read_right_or_refused(base, case):
         return
     assert said(base, other) == words
     assert bool(said(other, base)) == bool(words)  # and as the reference
+
+
+def test_what_is_no_number_has_no_distance(base):
+    other = base.with_name("other.xml")
+    other.write_text(BASE.replace('speed="20.00"', 'speed="nan"'))
+    report = diff(base, other)
+    (only,) = report.findings
+    assert only.first is not None
+    assert told(only.first.place) == "20 -> no number"
+    assert report.first == "fcd: 0 s, id a: speed 20 -> no number"
+    assert "inf" not in "".join(report.lines())
+
+
+def test_logs_of_two_kinds_are_refused(base):
+    other = base.with_name("other.xml")
+    other.write_text(BASE.replace("fcd-export", "emission-export"))
+    with pytest.raises(InputError, match=r"base\.xml is a log of fcd, .*other\.xml of emission: they cannot be compared"):
+        diff(base, other)
 
 
 def frame():

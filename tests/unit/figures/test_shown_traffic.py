@@ -220,7 +220,9 @@ def test_any_rail_net_is_drawn(merging, tmp_path, monkeypatch, capsys):
 def test_tables_of_such_runs_name_trains_only_while_they_are_there(numeric):
     again = Run(numeric.folder)
     assert again.trains["in_formation"].isin((0.0, 1.0)).all()
-    assert set(again.trains["train"].astype(str)) < {t["id"] for t in again.scenario["train"]}
+    first = again.trains.astype({"train": str}).groupby("train").time_s.min()
+    assert first.to_dict() == {e["train"]: e["time_s"] for e in again.events if e["kind"] == "depart"}
+    assert first["fast.1"] == 70.0
 
 
 @pytest.mark.parametrize("place", [120, 400, 1200])

@@ -362,7 +362,7 @@ BOMB = '<!DOCTYPE x [<!ENTITY a "lol"><!ENTITY b "&a;&a;&a;">]><fcd-export><time
         (FCD[:200].encode(), "not well-formed"),
         (FCD.replace('"10"', '"fast"').encode(), "fast"),
         (FCD.replace('"10"', '"nan"').encode(), "not finite"),
-        (FCD.replace("2.00", "-2.00").encode(), "does not ascend"),
+        (FCD.replace("2.00", "-2.00").encode(), "does not ascend: -2 s after 0 s"),
         (b'<fcd-export><timestep time="0"/></fcd-export>', "no vehicle"),
         (b'<fcd-export><timestep><vehicle id="a" speed="1"/></timestep></fcd-export>', "outside any timestep with a time"),
         (b'<fcd-export><timestep time="0"><vehicle id="a"/></timestep></fcd-export>', "without id or speed"),

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from trainctl.railway import along, bodies, interlocking
+from trainctl.railway import along, bodies, interlocking, zones
 from trainctl.railway.ways import ways as laid
 
 BRAKING = 0.8  # m/s2
@@ -51,10 +51,10 @@ class Yard:
         ways = self.net.ways(self.paths)
         row = np.array([ways.first[i] + self.paths[i].index(e) for i, (e, _) in enumerate(self.at)])
         s = ways.begin[row] + [x for _, x in self.at]
-        zones = interlocking.zones(ways, along.net(self.net))
+        shared = zones.of(ways, along.net(self.net))
         before = json.dumps(self.state)
         arrays = (row, s, self.length, self.present)
-        self.state, held, said = interlocking.request(zones, self.state, *arrays, self.reach, self.clearance, **more)
+        self.state, held, said = interlocking.request(shared, self.state, *arrays, self.reach, self.clearance, **more)
         assert json.loads(json.dumps(self.state)) == json.loads(json.dumps(self.state)) and before is not None
         self.state = json.loads(json.dumps(self.state))  # as a checkpoint keeps it
         return held, said
@@ -169,6 +169,80 @@ def test_a_train_that_wants_to_enter_the_net_in_a_stretch_waits_for_it():
     assert said[-1].train == 1
 
 
+def test_a_train_that_waits_to_enter_keeps_its_turn_at_the_join_and_who_comes_later_waits():
+    yard = Yard(MERGE, [("a m", "a", 200, 100), ("b m", "b", 800, 100), ("a m", "a", 700, 100)], clearance=10.0)
+    yard.present[1], entering = False, np.array([False, True, False])
+    yard.reach = np.array([400.0, 300.0, 400.0])
+    held, _ = yard.now(entering=entering)
+    assert held.room.tolist() == [np.inf, np.inf, np.inf]  # the third could perhaps not wait any more, the first is far
+    yard.put(0, "a", 650.0)
+    yard.put(2, "m", 300.0)
+    held, said = yard.now(entering=entering)
+    assert (held.room[0], held.by[0], held.zone[0]) == (350.0, 1, MERGE.number["m"])
+    assert [(d.train, d.by, d.join) for d in said] == [(0, 1, True)]
+    yard.present[1] = True
+    assert np.isinf(yard.now()[0].room).all()  # it has come: the one behind follows
+
+
+def test_who_is_to_enter_in_the_middle_of_a_line_gets_its_gap():
+    net = railway({"a": 1000, "b": 1000}, [("a", "b")])
+    yard = Yard(net, [("a b", "a", 500, 100), ("b", "b", 100, 100), ("a b", "a", 100, 100)])
+    yard.present[1], entering = False, np.array([False, True, False])
+    yard.reach = np.array([600.0, 100.0, 600.0])
+    assert np.isinf(yard.now(entering=entering)[0].room).all()
+    yard.put(0, "b", 300)
+    yard.put(2, "a", 500)
+    held, _ = yard.now(entering=entering)
+    assert (held.room[2], held.by[2]) == (500.0, 1) and np.isinf(held.room[:2]).all()
+
+
+def test_nobody_enters_where_another_one_is_and_it_bars_nobody():
+    yard = Yard(SINGLE, [("a s b", "a", 950, 200), ("a s b", "a", 900, 100), ("c S d", "c", 950, 100)], clearance=10.0)
+    yard.present[1], entering = False, np.array([False, True, False])
+    yard.reach[0] = 10.0
+    held, _ = yard.now(entering=entering)
+    assert (held.room[1], held.by[1]) == (0.0, 0) and np.isinf(held.room[2])
+
+
+def test_a_request_ends_at_the_own_stop_and_what_lies_ahead_of_a_stand_is_given_back():
+    trains = [("a s b", "a", 700, 200), ("c S d", "c", 700, 100)]
+    for place, capped in ((980.0, False), (900.0, True)):
+        yard = Yard(SINGLE, trains, clearance=50.0)
+        yard.reach[:] = 400.0
+        stop = np.array([place, np.inf])
+        held, _ = yard.now(stop=stop)
+        assert held.room.tolist() == ([300.0, np.inf] if capped else [np.inf, 300.0])  # what it did not request is not its own
+        yard.put(0, "a", place)
+        held, _ = yard.now(stop=stop, stands=np.array([True, False]))
+        assert held.room.tolist() == [1000.0 - place, np.inf]
+        held, _ = yard.now()
+        assert held.by.tolist() == [1, -1]  # now it comes in its turn
+        yard.put(1, "d", 200)
+        assert np.isinf(yard.now()[0].room).all()
+
+
+def test_a_join_beyond_the_own_stop_is_not_requested():
+    yard = Yard(MERGE, [("a m", "a", 700, 100), ("b m", "b", 600, 100)])
+    yard.reach[:] = 500.0
+    yard.now(stop=np.array([900.0, np.inf]))
+    assert yard.state["joins"] == {str(MERGE.number["m"]): [1]}
+
+
+def test_a_stand_keeps_what_nobody_could_get_out_without():
+    """A train longer than its platform: its tail shuts the single track behind, so it keeps the one ahead."""
+    net = railway(
+        {"a": 1000, "s": 900, "p": 300, "t": 900, "b": 1000, "c": 1000, "T": 900, "q": 400, "S": 900, "d": 1000},
+        [("a", "s"), ("s", "p"), ("p", "t"), ("t", "b"), ("c", "T"), ("T", "q"), ("q", "S"), ("S", "d")],
+        twins=[("s", "S"), ("t", "T")],
+    )  # fmt: skip
+    yard = Yard(net, [("a s p t b", "p", 290, 500), ("c T q S d", "c", 950, 100)])
+    held, _ = yard.now(stop=np.array([2190.0, np.inf]), stands=np.array([True, False]))
+    assert np.isinf(held.room[0]) or held.by[0] != 1
+    yard.length[0] = 200.0
+    held, _ = yard.now(stop=np.array([2190.0, np.inf]), stands=np.array([True, False]))
+    assert np.isinf(held.room[1])  # a short one gives way
+
+
 LINE = railway(
     {
         "w1": 1500, "w2": 1700, "j": 700, "x": 20, "r": 300, "s": 900, "t": 800, "A": 500, "u": 1200, "o": 900,
@@ -208,7 +282,7 @@ def drive(net_of, routes, seed, n, limit=9000):
     kind = rng.integers(0, len(routes), n)
     ways = net_of.ways([[net_of.number[e] for e in routes[k].split()] for k in kind])
     net = along.net(net_of)
-    zones = interlocking.zones(ways, net)
+    shared = zones.of(ways, net)
     length = rng.uniform(40.0, 480.0, n)
     departs = np.sort(rng.uniform(0.0, 900.0, n))
     acceleration, top = rng.uniform(0.2, 0.8, n), rng.uniform(10.0, TOP, n)
@@ -223,7 +297,7 @@ def drive(net_of, routes, seed, n, limit=9000):
             if min(rest, default=np.inf) > length[i] + 20.0:
                 present[i], s[i] = True, length[i]
         reach = v**2 / (2 * BRAKING) + 3 * v + 2 * MARGIN
-        state, held, _ = interlocking.request(zones, state, row, s, length, present, reach, 2 * MARGIN)
+        state, held, _ = interlocking.request(shared, state, row, s, length, present, reach, 2 * MARGIN)
         here = along.places(ways, net, row, s, length, present, 3000.0, interlocking.order(state))
         room = np.minimum(bodies.obstacles(here, virtual=False).room, held.room) - MARGIN
         wanted = np.minimum(v + acceleration, top)

@@ -123,6 +123,9 @@ class Unheard:
     def write(self, row):
         pass
 
+    def call(self, train, call, edge):
+        pass
+
 
 #: The scenario, where everything is told, and what only the user sets.
 OUTSIDE = {"p", "world", "journal", "between"}
@@ -190,7 +193,7 @@ CHANGED = {
     "actuators": ("plant.sent_at", "plant.counted", "plant.heard", "plant.estimate", "messages.sent"),
     "points": ("orders.pending", "messages.ever", "rule.track", "formed.formation", "messages.sent"),
     "formations, stops": (
-        "requests", "came", "left", "next_stop", "stands_until", "stopping", "rule.slot", "ask_at", "parted", "refused",
+        "requests", "came", "left", "next_stop", "stands_since", "stands_until", "stopping", "rule.slot", "ask_at", "parted", "refused",
         "formed.ahead", "formed.led", "formed.offset", "references.position",
     ),
     "single track": ("waits_for", "requests"),

@@ -37,7 +37,7 @@ CASES = {
     "unknown key": (PAPER + "[run]\ndt = 1\n", ["run.dt: unknown key; known: duration_s"]),
     "unknown key of the law": (PAPER + "[controller]\nkv = 1.0\n", ["controller.kv: unknown key; known: eta, join"]),
     "near miss": (PAPER + "[run]\nduraton_s = 1\n", ["run.duraton_s: unknown key; did you mean duration_s?"]),
-    "wrong type": (PAPER + '[bounds]\nspeed_upper_mps = "85"\n', ["bounds.speed_upper_mps = 85: input should be a valid number"]),
+    "wrong type": (PAPER + '[bounds]\nspeed_upper_mps = "85"\n', ['bounds.speed_upper_mps = "85": input should be a valid number']),
     "wrong unit": (PAPER + "[[train]]\nid = 1\nspeed_kmh = 288\n", ["train[1].speed_kmh: unknown key"]),
     "below a bound": (PAPER + "[[train]]\nid = 2\nspeed_mps = 91.0\n", ["train[2].speed_mps = 91: above speed_upper_mps = 85"]),
     "outside (13)": (PAPER + "[[train]]\nid = 2\nposition_m = 23950.0\n", ["spacing at the start is 50 m", "eq. (13), is 53 m"]),
@@ -186,9 +186,10 @@ def test_each_mistake_is_told_in_words(case, typed, tmp_path):
     [
         ('extends = "fault_tolerant"\n[controller]\ncarriage_l1 = [0.1, 0.1]\n', "controller.carriage_l1 = [0.1, 0.1]: has 2 values, it takes"),
         ('extends = "fault_tolerant"\n[controller]\ncarriage_l1 = [0.1, -0.1, 0.1]\n', "controller.carriage_l1[2] = -0.1: input should be greater than 0"),
-        ('extends = "fault_tolerant"\n[controller]\nhead_l4 = "x"\n', "controller.head_l4 = x: input should be a valid number"),
+        ('extends = "fault_tolerant"\n[controller]\nhead_l4 = "x"\n', 'controller.head_l4 = "x": input should be a valid number'),
+        ('extends = "emu_finite_time"\n[controller]\np_1 = [1, "a"]\n', 'controller.p_1 = [1, "a"]: input should be a valid number'),
         ('extends = "emu_finite_time"\n[train_type.emu]\nunit_mass_kg = [6e4, 8e4]\n', "train_type.emu: unit_mass_kg has 2 values: units = 4 of them"),
-        ('extends = "emu_finite_time"\n[train_type.emu]\nunit_mass_kg = [6e4, "x", 8e4, 8e4]\n', "train_type.emu.unit_mass_kg[2] = x: input should be"),
+        ('extends = "emu_finite_time"\n[train_type.emu]\nunit_mass_kg = [6e4, "x", 8e4, 8e4]\n', 'train_type.emu.unit_mass_kg[2] = "x": input should be'),
     ],
 )  # fmt: skip
 def test_one_line_for_a_mistake_in_a_list(text, line, typed, tmp_path):
@@ -208,9 +209,9 @@ def test_all_mistakes_come_at_once(typed, tmp_path):
     code, lines = typed("check", "mistaken.toml")
     assert code == 2
     for key in (
-        "run.duration_s = long",
+        'run.duration_s = "long"',
         "run.dt:",
-        "bounds.speed_upper_mps = 85",
+        'bounds.speed_upper_mps = "85"',
         "train[3].position_m = -5",
         "event[1].crossover",
     ):

@@ -53,11 +53,11 @@ def test_the_tighter_acts_and_check_says_what_was_said(tmp_path: Path) -> None:
     model = written(tmp_path, own={"input_upper_mps2": 1.2, "speed_upper_mps": 81.0}, input_upper_mps2=0.9)
     assert model.bounds.input_upper.tolist() == [0.9] * 3
     assert model.bounds.speed_upper.tolist() == [85.0, 81.0, 85.0]
-    told = [line for line in facts(model)["warnings"] if "the tighter acts" in line]
+    told = [line for line in facts(model)["warnings"] if "the tightest acts" in line]
     assert told == [
-        "speed_upper_mps of train 2 = 81: the tighter acts of 85 in [bounds], 81 in [[train]]",
-        "input_upper_mps2 of trains 1, 3 = 0.9: the tighter acts of 1 in [bounds], 0.9 in [plant]",
-        "input_upper_mps2 of train 2 = 0.9: the tighter acts of 1 in [bounds], 0.9 in [plant], 1.2 in [[train]]",
+        "speed_upper_mps of train 2 = 81: 85 in [bounds], 81 in [[train]]; the tightest acts",
+        "input_upper_mps2 of trains 1, 3 = 0.9: 1 in [bounds], 0.9 in [plant]; the tightest acts",
+        "input_upper_mps2 of train 2 = 0.9: 1 in [bounds], 0.9 in [plant], 1.2 in [[train]]; the tightest acts",
     ]
 
 

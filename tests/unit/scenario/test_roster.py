@@ -236,7 +236,7 @@ def test_a_stop_is_called_by_its_station_else_by_its_edge(enrolled: Read) -> Non
 def test_trains_keep_their_own_stops(enrolled: Read) -> None:
     _, roster, _ = enrolled(nets.train("a", WAY, 0) + nets.train("b", WAY, 50, stop("in", 900)))
     start = float(roster.rails.start_m[roster.rails.index["in"]])
-    assert roster.stops == ((), (Stop(start + 900.0, 10.0, -np.inf, "in"),))
+    assert roster.stops == ((), (Stop(start + 900.0, 10.0, -np.inf, "in", edge="in"),))
 
 
 # Who forms up

@@ -54,8 +54,9 @@ def test_a_train_enters_when_the_one_before_has_gone_far_enough(line):
     loop, told = started(p)
     ids, leading = p.scenario.ids, p.leading
     first, second = ids.index("p.0"), ids.index("p.1")
-    assert loop.state.traffic.came[first] and told.kinds()[0] == ("depart", "p.0")
+    assert loop.state.traffic.came[first] and loop.state.traffic.entering[first]
     loop.step()
+    assert told.kinds()[0] == ("depart", "p.0") and not loop.state.traffic.entering[first]
     for _ in range(2):  # the same question twice gets the same answer: nothing is remembered but in the state
         for metres, enters in ((300.0, False), (1300.0, True)):
             seen = loop.world.measure()
@@ -66,9 +67,14 @@ def test_a_train_enters_when_the_one_before_has_gone_far_enough(line):
             s, at = loop.traffic.step(40.0, loop.world.ways, seen, speed, 0.0 * speed, before)
             assert (second in [i for i, _ in at.entries]) is enters is bool(s.came[second]), metres
             assert not before.came[second]
-            assert (("depart", "p.1") in told.kinds()) is enters
+            assert bool(s.entering[second]) is enters and told == []
             if enters:
                 assert dict(at.entries)[second] == speed[second] > 30.0
+                seen.present[second] = True
+                after = loop.traffic.departures(41.0, seen, speed, s)
+                (_, event), *more = told
+                assert (event["train"], event["delay_s"], event["speed_mps"]) == ("p.1", 1.0, speed[second]) and not more
+                assert not after.entering[second]
             else:
                 assert at.kept_out[second] == first
 

@@ -1,0 +1,137 @@
+"""Whether everybody can still get out if a train is let in: the rule that no trains come to wait for each other in a circle.
+
+Every train runs on by itself until it *stands*: before the first stretch ahead that it has not been granted, before a join where it
+is another's turn, or behind a train that stands ahead of it; or it leaves the net. Trains that stand before one stretch stand
+behind each other. Train i *needs* train j if j may stand where i still has to pass: ahead of it on its way, on the twin of an edge
+of it, or across; or if j goes before it, at its turn or where both stand. A state is *safe* if no train needs, directly or through
+others, itself. A stretch is granted, and a train let into the net, only if it does not need itself afterwards.
+
+Circles of joins alone, without single track or crossings, are not looked at (a roundabout that is full): those are told, see
+``monitors.waiting``.
+
+Progress. In a safe state some train needs nobody: a finite graph without a circle has a node without successors. When all stand,
+its whole way is free, and nobody goes before it. If it is granted what it asks for next it still needs nobody, so it is on no
+circle then, and the rule lets it go. So whenever all stand somebody is granted something, and every train has finitely many
+stretches. What else could keep it: a request that waits bars later ones only while what it waits for clears by itself, that is, if
+nobody stands there; and who is to enter has nothing that others could need.
+
+The test is a search over edges of ways, and for trains behind each other over pairs of trains: polynomial in trains and edges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+from trainctl.railway.along import Net
+from trainctl.railway.ways import Ways
+from trainctl.signals import Floats, Ints
+
+#: Whether train j comes before train i to an edge, at its row m of the one and k of the other: (j, m, i, k).
+Before = Callable[[int, int, int, int], bool]
+
+
+class Standing(NamedTuple):
+    """Where trains may come to stand if nothing more is granted."""
+
+    ways: Ways
+    net: Net
+    row: Ints
+    on: Mapping[int, Sequence[tuple[int, int, float]]]  # edge: trains that stand on it, its row in their ways, and their rears [m]
+    before: Mapping[int, Sequence[int]]  # train: those that go before it where it stands
+
+
+def standing(
+    ways: Ways, net: Net, row: Ints, s: Floats, length: Floats, clearance: float, limits: Mapping[int, int],
+    turns: Iterable[tuple[int, int, Sequence[int]]], goes_before: Before,
+) -> Standing:  # fmt: skip
+    """Where trains may come to stand.
+
+    Parameters
+    ----------
+    ways, net : Ways, Net
+        Of all n trains.
+    row, s, length : ndarray, shape (n,)
+        As in ``along.places``.
+    clearance : float
+        Room one standing train needs beyond its length [m].
+    limits : mapping
+        Of every train on the net: first row that it may not enter, -1 if there is none.
+    turns : iterable
+        Train, row of a join, and the trains that have their turns there before it.
+    goes_before : callable
+        See ``Before``.
+    """
+    on: dict[int, list[tuple[int, int, float]]] = {}
+    before: dict[int, list[int]] = {i: [] for i in limits}
+
+    def stands(i: int, front: float, k: int, room: float) -> None:
+        """Train i stands with its front at ``front``, before the end of row k, or up to ``room`` - its length farther back."""
+        rear = front - room
+        while k > ways.first[i] and ways.begin[k] >= front:
+            k -= 1
+        while True:
+            on.setdefault(int(ways.edge[k]), []).append((i, k, rear))
+            if k == ways.first[i] or ways.begin[k] <= rear:
+                return
+            k -= 1
+
+    at: dict[int, list[int]] = {}
+    for i, k in limits.items():
+        if k >= 0:
+            at.setdefault(int(ways.edge[k]), []).append(i)
+    for trains in at.values():
+        trains.sort(key=lambda i: (ways.begin[limits[i]] - s[i], i))
+        behind = 0.0
+        for place, i in enumerate(trains):
+            before[i] += trains[:place]
+            behind += length[i]
+            stands(i, float(ways.begin[limits[i]]), limits[i], behind)
+            behind += clearance
+    for i, k, others in turns:
+        if others:
+            before[i] += others
+            stands(i, float(ways.begin[k]), k, float(length[i]))
+    here, known, fresh = Standing(ways, net, row, on, before), set[tuple[int, int]](), True
+    while fresh:
+        fresh = False
+        for i, limit in limits.items():
+            for k in range(int(row[i]), limit if limit >= 0 else int(ways.first[i + 1])):
+                for j, m, rear in tuple(on.get(int(ways.edge[k]), ())):
+                    if j != i and (i, j) not in known and i not in before[j] and goes_before(j, m, i, k):
+                        known.add((i, j))
+                        fresh = True
+                        stands(i, float(ways.begin[k] + max(rear - ways.begin[m], 0.0) - clearance), k, float(length[i]))
+    return here
+
+
+def needs(here: Standing, i: int, goes_before: Before) -> Iterable[int]:
+    """Trains that must have gone before ``i`` can leave."""
+    ways = here.ways
+    yield from here.before.get(i, ())
+    for k in range(int(here.row[i]), int(ways.first[i + 1])):
+        yield from against(here, i, k)
+        for j, m, _ in here.on.get(int(ways.edge[k]), ()):
+            if j != i and i not in here.before[j] and goes_before(j, m, i, k):
+                yield j
+
+
+def against(here: Standing, i: int, k: int) -> Iterable[int]:
+    """Trains that stand on the twin of, or across, the edge at row k of the way of ``i``."""
+    net, e = here.net, int(here.ways.edge[k])
+    for f in (int(net.twin[e]), *net.cross[net.cross_first[e] : net.cross_first[e + 1]].tolist()):
+        yield from (j for j, _, _ in here.on.get(f, ()) if j != i)
+
+
+def in_a_circle(here: Standing, i: int, goes_before: Before) -> int:
+    """A train through which ``i`` needs itself, the first on the circle; -1: it does not."""
+    begun: dict[int, int] = {}  # train: by which need of ``i`` it was found
+    rest = [(j, j) for j in needs(here, i, goes_before)]
+    while rest:
+        j, by = rest.pop()
+        if j == i:
+            return by
+        if j not in begun:
+            begun[j] = by
+            rest += [(k, by) for k in needs(here, j, goes_before)]
+    return -1

@@ -1,0 +1,174 @@
+"""What is exclusive along the ways of trains, and where the trains are on them: what the interlocking decides on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from trainctl.kernels import keep_by_sources
+from trainctl.railway import deadlock
+from trainctl.railway.along import Net
+from trainctl.railway.ways import Ways
+from trainctl.signals import Bools, Floats, Ints
+
+keep_by_sources()  # before anything below is decorated
+
+
+class Zones(NamedTuple):
+    """What is exclusive along every way; to be made anew when ways change. W rows as in ``ways``."""
+
+    ways: Ways
+    net: Net
+    begins: Ints  # (W,) first row of the stretch this row is in, -1: in none
+    ends: Ints  # (W,) last row of it, -1
+    following: Ints  # (W,) first row of the next stretch after this row's, -1: none
+
+
+def of(ways: Ways, net: Net) -> Zones:
+    """Find the stretches along all ways: edges whose twin, or an edge across them, is on any way as well."""
+    used = np.zeros(len(net.length), bool)
+    used[ways.edge] = True
+    across = np.repeat(np.arange(len(used)), np.diff(net.cross_first))
+    shared = (net.twin >= 0) & used[net.twin]
+    shared |= np.bincount(across, weights=used[net.cross], minlength=len(used)) > 0
+    return Zones(ways, net, *_stretches(ways, shared))
+
+
+class Trains(NamedTuple):
+    """Where the trains are."""
+
+    zones: Zones
+    row: Ints
+    s: Floats
+    length: Floats
+    entry: Ints  # edges over which trains enter their next stretch, ascending
+    comer: Ints  # those trains
+
+    def coming(self, e: int) -> list[int]:
+        """Trains whose next stretch begins with edge ``e``."""
+        found: list[int] = self.comer[np.searchsorted(self.entry, e) : np.searchsorted(self.entry, e, side="right")].tolist()
+        return found
+
+    def before(self, queues: dict[int, list[int]]) -> deadlock.Before:
+        """Who comes before whom, see ``deadlock.Before``."""
+        return lambda j, m, i, k: self.goes_before(j, m, i, k, queues)
+
+    def track(self, i: int, k: int) -> int:
+        """Edge over which ``i`` comes to that of row k; -1: it begins there."""
+        return int(self.zones.ways.edge[k - 1]) if k > self.zones.ways.first[i] else -1
+
+    def distance(self, i: int, k: int) -> float:
+        """From the front of a train to its row k [m]."""
+        return float(self.zones.ways.begin[k] - self.s[i])
+
+    def goes_before(self, i: int, k: int, j: int, m: int, queues: dict[int, list[int]]) -> bool:
+        """Whether ``i`` comes before ``j`` to the edge at their rows k and m, by where they stand or by their turns before it."""
+        edge = self.zones.ways.edge
+        nearer = (self.distance(i, k), i) < (self.distance(j, m), j)
+        while k > self.row[i] and m > self.row[j]:
+            if edge[k - 1] != edge[m - 1]:
+                turns = queues.get(int(edge[k]), [])
+                if i in turns and j in turns:
+                    return turns.index(i) < turns.index(j)
+                return i in turns or (j not in turns and nearer)
+            k, m = k - 1, m - 1
+        return nearer
+
+
+class Index:
+    """Which trains request each edge."""
+
+    def __init__(self, zones: Zones, trains: Trains) -> None:
+        self.zones, self.trains, self.on = zones, trains, dict[int, list[int]]()
+
+    def add(self, i: int, rows: Iterable[int]) -> None:
+        """Put in train ``i`` on what its rear has not left of the stretches that begin at these rows."""
+        ways = self.zones.ways
+        rear = self.trains.s[i] - self.trains.length[i]
+        for k in rows:
+            for r in range(k, self.zones.ends[k] + 1):
+                if ways.begin[r] + self.zones.net.length[ways.edge[r]] > rear:
+                    self.on.setdefault(int(ways.edge[r]), []).append(i)
+
+    def blocker(self, i: int, rows: Iterable[int]) -> int:
+        """A train that requests the twin of, or what is across, an edge of the stretches of ``i`` at these rows; -1: none."""
+        net, edge = self.zones.net, self.zones.ways.edge
+        for k in rows:
+            for r in range(k, self.zones.ends[k] + 1):
+                e = int(edge[r])
+                for f in (int(net.twin[e]), *net.cross[net.cross_first[e] : net.cross_first[e + 1]].tolist()):
+                    for j in self.on.get(f, ()):
+                        if j != i:
+                            return j
+        return -1
+
+
+def coming(zones: Zones, row: Ints, present: Bools) -> tuple[Ints, Ints]:
+    """Edges over which trains enter their next stretch, ascending, and those trains."""
+    train = np.flatnonzero(present)
+    train = train[zones.following[row[train]] >= 0]
+    entry = zones.ways.edge[zones.following[row[train]]]
+    by_edge = np.argsort(entry, kind="stable")
+    return entry[by_edge], train[by_edge]
+
+
+def under(ways: Ways, row: Ints, s: Floats, length: Floats, i: int) -> Iterable[int]:
+    """Rows of the edges under a train, from its front to its rear, as far as its way goes back."""
+    k = int(row[i])
+    yield k
+    while k > ways.first[i] and ways.begin[k] > s[i] - length[i]:
+        k -= 1
+        yield k
+
+
+@njit(cache=True)
+def _stretches(ways: Ways, shared: Bools) -> tuple[Ints, Ints, Ints]:
+    """First and last row of every row's stretch, and the first row of the next one, shape (W,) each; -1: none."""
+    count = len(ways.edge)
+    begins, ends, following = np.full(count, -1, np.int64), np.full(count, -1, np.int64), np.full(count, -1, np.int64)
+    for i in range(len(ways.first) - 1):
+        for k in range(ways.first[i], ways.first[i + 1]):
+            if shared[ways.edge[k]]:
+                begins[k] = begins[k - 1] if k > ways.first[i] and begins[k - 1] >= 0 else k
+        for k in range(ways.first[i + 1] - 2, ways.first[i] - 1, -1):
+            following[k] = begins[k + 1] if begins[k + 1] == k + 1 else following[k + 1]
+        for k in range(ways.first[i + 1] - 1, ways.first[i] - 1, -1):
+            if begins[k] >= 0:
+                more = k + 1 < ways.first[i + 1] and begins[k + 1] >= 0
+                ends[k] = ends[k + 1] if more else k
+    return begins, ends, following
+
+
+@njit(cache=True)
+def near(
+    zones: Zones, joining: Bools, row: Ints, s: Floats, length: Floats, on: Bools, outside: Bools, until: Floats
+) -> tuple[Ints, Ints, Bools]:
+    """What every train has to request, from its rear up to ``until``: train, row, whether it is a join (or a stretch)."""
+    ways, begins = zones.ways, zones.begins
+    count = 0
+    for again in range(2):
+        if again:
+            train, at, is_join = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.bool_)
+        count = 0
+        for i in range(len(row)):
+            if not on[i]:
+                continue
+            rear, first = s[i] - length[i], ways.first[i]
+            back = row[i]
+            while back > first and ways.begin[back] > rear:
+                back -= 1
+            for k in range(back, ways.first[i + 1]):
+                if k > row[i] and ways.begin[k] > until[i]:
+                    break
+                if begins[k] >= 0 and (k == back or begins[k] == k):
+                    if again:
+                        train[count], at[count], is_join[count] = i, begins[k], False
+                    count += 1
+                if joining[ways.edge[k]] and (outside[i] if k == first else ways.begin[k] > rear):
+                    if again:
+                        train[count], at[count], is_join[count] = i, k, True
+                    count += 1
+    return train, at, is_join
