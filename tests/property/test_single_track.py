@@ -7,7 +7,9 @@ import pytest
 from decisions import Plan, at_random, played, railway
 
 
-@pytest.mark.parametrize("seed", [*range(12), 22, 46, 517, 546, 554, 598, 611, 674])  # the named ones stood still by the older rules
+@pytest.mark.parametrize(
+    "seed", [*range(12), 22, 46, 517, 546, 554, 598, 611, 674]
+)  # the named ones stood still by the older rules
 def test_everybody_gets_out(seed):
     played(at_random(seed), seed)
 

@@ -154,7 +154,7 @@ class Plan(NamedTuple):
 
 def plans(drawn: Drawn, corridor: Corridor) -> dict[str, Plan]:
     """The timetable of the trains of a corridor, from stops.parquet; empty without one."""
-    stops = drawn.run.table("stops", missing_is_empty=True)
+    stops = drawn.run.stops
     if not len(stops):
         return {}
     at_of = {place.name: place.at_m / 1000 for place in corridor.places if place.kind == "stop"}
@@ -193,7 +193,7 @@ def numbered_at(distance: Floats, k: int) -> int:
     """Row at which the number of the k-th train stands on its line; those of trains that run close together one after the other."""
     some = np.flatnonzero(np.isfinite(distance))
     way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(distance[some])))])  # where a train stands, marks and places stand too
-    return int(some[np.searchsorted(way, (0.12 + 0.1 * (k % 5)) * way[-1]).clip(0, len(some) - 1)])
+    return int(some[np.searchsorted(way, (0.25 + 0.1 * (k % 5)) * way[-1]).clip(0, len(some) - 1)])
 
 
 def _number(panel: Axes, lines: dict[str, tuple[Floats, Floats]], drawn: Drawn) -> None:
