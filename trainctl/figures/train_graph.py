@@ -140,7 +140,7 @@ def _marks(axes: list[Axes], found: list[Corridor], drawn: Drawn, kind: str) -> 
             if name in corridor.distance:
                 at = float(np.interp(event["time_s"], time[rows_of[name]], corridor.distance[name] / 1000))
                 if np.isfinite(at):
-                    panel.plot(event["time_s"], at, color=drawn.colour[name], markeredgewidth=0.5, zorder=4, **look)
+                    panel.plot(event["time_s"], at, color=drawn.colour[name], markeredgewidth=0.5, zorder=6, **look)
     return [Line2D([], [], color=style.GREY, markeredgewidth=0.5, label=f"{words} ({len(events)})", **look)] if events else []
 
 
