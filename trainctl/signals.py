@@ -385,7 +385,7 @@ class Plant(Protocol):
 
 
 class PointPlant(Plant, Protocol):
-    """Trains as points, moved from step to step by an exact map: see ``plants.point`` for ``Kick`` and ``Moved``."""
+    """Trains as points, moved from step to step by an exact map: see ``plants.point`` for ``Kick`` and ``Mapped``."""
 
     def constants(
         self, params: Any, consists: Consists, resistance_factor: Floats | None = None, gradient: Floats | None = None,

@@ -241,7 +241,7 @@ def test_a_hundred_trains_of_eight_run_faster_than_real_time(plant_under: str, t
     else:
         constants, part, live = shared.constants(coupled_units.Params(), scene.consists), shared, False
         constants.acceleration[:] = 0.05
-    loop = integrate.Loop(constants, none.Constants(), coupled_units.constants(coupled_units.Params(), scene.consists))
+    loop = integrate.Inner(constants, none.Constants(), coupled_units.constants(coupled_units.Params(), scene.consists))
     own, estimate = scene.own.copy(), np.zeros((800, 0))
     air = integrate.Air(np.zeros((len(scene.links.sender), part.MESSAGE)), live, False, 0.0)
     work = integrate.scratch(own, estimate, 100, 0, part.MESSAGE)

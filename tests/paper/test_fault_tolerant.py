@@ -64,7 +64,7 @@ def small_steps(every: float, duration: float) -> tuple[Example, list[np.ndarray
     run = Example(scene=paper_scene(sub_step=0.002), faults=[])
     s = run.scene
     law_constants, observer = law.constants(run.params, s), asymptotic.constants(asymptotic.Params(), s)
-    loop = integrate.Loop(law_constants, observer, plant.constants(NOISY, s.consists, trains=s.trains))
+    loop = integrate.Inner(law_constants, observer, plant.constants(NOISY, s.consists, trains=s.trains))
     own, estimate = s.own.copy(), asymptotic.initial(asymptotic.Params(), s.own)
     air = integrate.Air(np.zeros((2, law.MESSAGE)), True, True, 0.0)
     work, extremes = integrate.scratch(own, estimate, 3, 5, 4), Extremes.fresh(3, 9, 3)

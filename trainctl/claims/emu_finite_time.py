@@ -105,7 +105,7 @@ def run(scene: Scene, seconds: int, params: law.Params | None = None, step: floa
     """Integrate law and plant; ``period`` holds the messages between trains for that long."""
     params = params or law.Params()
     links, own, estimate = scene.links, scene.own.copy(), np.zeros((len(scene.own), 0))
-    loop = integrate.Loop(
+    loop = integrate.Inner(
         law.constants(params, scene), none.Constants(), coupled_units.constants(coupled_units.Params(), scene.consists)
     )
     air = integrate.Air(np.zeros((len(links.sender), law.MESSAGE)), period is None, False, 0.0)

@@ -108,7 +108,7 @@ class Example:
         if self.printed_D1:  # D1 without -r v is the corrected observer with k2 - r: mu2 and zeta become the same
             observer_constants = observer_constants._replace(k2=observer_constants.k2 - 50.0)
         moving = plant.constants(NOISY, c, faults=self.faults, trains=s.trains)
-        loop = integrate.Loop(law_constants, observer_constants, moving)
+        loop = integrate.Inner(law_constants, observer_constants, moving)
         own, estimate = s.own.copy(), observer.initial(observer_params, s.own)
         air = integrate.Air(np.zeros((2, law.MESSAGE)), self.period is None, True, 0.0)
         work = integrate.scratch(own, estimate, 3, observer.CORRECTIONS, law.MESSAGE)

@@ -106,9 +106,9 @@ class Loop:
         clamps = point.Params(input_lower_mps2=-2.0, input_upper_mps2=2.0, speed_lower_mps=0.0, speed_upper_mps=85.0)
         self.plant = point.constants(clamps, start.consists)
         self.held = round(start.control_period / start.step)
-        self.moved: point.Moved | None = None
+        self.moved: point.Mapped | None = None
 
-    def step(self) -> point.Moved:
+    def step(self) -> point.Mapped:
         """One step of law and plant."""
         n, t = len(self.own), self.k * self.scene.step
         d = self.kicks(self.k, self.own[:, POSITION])

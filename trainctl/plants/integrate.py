@@ -58,7 +58,7 @@ class Orders(NamedTuple):
 NO_ORDERS = Orders(shared.NOBODY, np.zeros(0))
 
 
-class Loop(NamedTuple):
+class Inner(NamedTuple):
     """Constants of the three parts, and the orders of this step."""
 
     law: Any
@@ -372,7 +372,7 @@ def from_cache(kernel: Any, place: str, arguments: tuple[Any, ...]) -> Callable[
 
 
 def advance(
-    parts: Parts, loop: Loop, first: Ints, length: Floats, links: Links, references: References, air: Air, t: float, h: float,
+    parts: Parts, loop: Inner, first: Ints, length: Floats, links: Links, references: References, air: Air, t: float, h: float,
     n: int, breaks: Floats, own: Floats, estimate: Floats, work: Scratch, extremes: Extremes,
 ) -> Floats:  # fmt: skip
     """Integrate ``own`` and ``estimate`` in place over ``n`` classic Runge-Kutta steps of ``h`` seconds from ``t``.
@@ -388,7 +388,7 @@ def advance(
 
 
 def exchange(
-    parts: Parts, loop: Loop, first: Ints, links: Links, references: References, air: Air, t: float, own: Floats, estimate: Floats,
+    parts: Parts, loop: Inner, first: Ints, links: Links, references: References, air: Air, t: float, own: Floats, estimate: Floats,
     work: Scratch,
 ) -> None:  # fmt: skip
     """Fill ``work.sent`` with what every train sends at ``t``, each from what it had heard until then."""

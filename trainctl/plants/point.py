@@ -81,7 +81,7 @@ class Kick(NamedTuple):
         return cls(np.zeros(trains), np.zeros(trains), np.zeros(trains))
 
 
-class Moved(NamedTuple):
+class Mapped(NamedTuple):
     """One step of all trains."""
 
     own: Floats  # (n, 2) position [m] and speed [m/s] after the step
@@ -190,7 +190,7 @@ def relied_on(
     return Reliance(np.minimum(braking, sure_braking(params, consists, top) - fall), pull, zero, zero, zero, zero)
 
 
-def advance(constants: Constants, own: Floats, acceleration: Floats, step: float, kick: Kick) -> Moved:
+def advance(constants: Constants, own: Floats, acceleration: Floats, step: float, kick: Kick) -> Mapped:
     """One step of all trains: fully_distributed (1); with disturbances and clamps robust_constrained (4).
 
     Parameters
@@ -208,7 +208,7 @@ def advance(constants: Constants, own: Floats, acceleration: Floats, step: float
 
     Returns
     -------
-    Moved
+    Mapped
 
     Notes
     -----
@@ -216,14 +216,16 @@ def advance(constants: Constants, own: Floats, acceleration: Floats, step: float
     in two things: the gradient, and standstill. Trains on a network do not run backwards, so neither a speed nor a displacement
     falls below 0.
     """
-    moved = Moved(np.empty_like(own), *np.empty((2, len(own))), *np.empty((2, len(own)), dtype=bool))
+    moved = Mapped(np.empty_like(own), *np.empty((2, len(own))), *np.empty((2, len(own)), dtype=bool))
     climb = climbing(own[:, POSITION], constants.gradient) + GRAVITY * constants.slope
     _advance(constants, own, climb, acceleration, step, kick, moved)
     return moved
 
 
 @njit(cache=True, error_model="numpy")
-def _advance(constants: Constants, own: Floats, climb: Floats, acceleration: Floats, step: float, kick: Kick, moved: Moved) -> None:
+def _advance(
+    constants: Constants, own: Floats, climb: Floats, acceleration: Floats, step: float, kick: Kick, moved: Mapped
+) -> None:
     """Write the step of every train into ``moved``. ``np.minimum`` and ``np.maximum`` pass on what is not a number."""
     c = constants
     for i in range(len(own)):

@@ -14,7 +14,7 @@ from trainctl.scenario.roster import Stop
 from trainctl.signals import POSITION, SPEED, Consists, Extremes, Floats, Row
 
 
-class Trains(NamedTuple):
+class Instant(NamedTuple):
     """An instant of all trains."""
 
     row: Row
@@ -59,7 +59,7 @@ STOPS: dict[str, tuple[Callable[[Call], float], str, str]] = {
 }  # fmt: skip
 
 #: trains.parquet, values (n,); ``saturated`` comes behind them.
-TRAINS: dict[str, Callable[[Trains], Floats]] = {
+TRAINS: dict[str, Callable[[Instant], Floats]] = {
     "position_m": lambda now: now.row.seen.position,
     "speed_mps": lambda now: now.row.speed,
     "input_mps2": lambda now: np.full(len(now.spacing), np.nan) if now.row.motion is None else now.row.motion.input,
@@ -89,12 +89,12 @@ UNITS: dict[str, Callable[[Units], Floats]] = {
 }
 
 
-def trains(row: Row, length: Floats) -> Trains:
+def trains(row: Row, length: Floats) -> Instant:
     """Gather what the columns of trains are taken from; ``length`` (n,) is that of the trains [m]."""
     position, spacing = row.seen.position, row.spacing
     if spacing is None:
         spacing = np.where(row.ahead >= 0, position[row.ahead] - position, np.nan)
-    return Trains(row, spacing, length)
+    return Instant(row, spacing, length)
 
 
 def units(row: Row, consists: Consists) -> Units:

@@ -197,8 +197,8 @@ class Units:
         )  # fmt: skip
         return now
 
-    def _loop(self, constants: Any, state: State) -> integrate.Loop:
-        return integrate.Loop(self.told if self.p.sampled else constants, state.observer, self.plant, self.orders)
+    def _loop(self, constants: Any, state: State) -> integrate.Inner:
+        return integrate.Inner(self.told if self.p.sampled else constants, state.observer, self.plant, self.orders)
 
     def _air(self, state: State) -> integrate.Air:
         return integrate.Air(state.heard, self.period is None, self.law.ORDER == "chain", state.sent_at)
@@ -324,7 +324,7 @@ class Units:
             if len(table):
                 table[:, coupled_units.SLOPE] = slope
 
-    def _extras(self, t: float, own: Floats, estimate: Floats, demanded: Floats, loop: integrate.Loop) -> dict[str, Floats]:
+    def _extras(self, t: float, own: Floats, estimate: Floats, demanded: Floats, loop: integrate.Inner) -> dict[str, Floats]:
         """What actuators, faults and observers do at ``t``, for the log."""
         if not self.p.plant.COLUMNS:
             return {}
@@ -341,7 +341,7 @@ class Units:
         return [(t + a * self.h, b - a) for a, b in pairwise([*starts, self.sub_steps])]
 
     def _exchange(
-        self, loop: integrate.Loop, references: References, air: integrate.Air, t: float, number: int, first_time: bool,
+        self, loop: integrate.Inner, references: References, air: integrate.Air, t: float, number: int, first_time: bool,
         own: Floats, links: Links, messages: Messages, state: State,
     ) -> tuple[Messages, integrate.Air]:  # fmt: skip
         """Send and hear at ``t``. A link opens with a message that arrives.

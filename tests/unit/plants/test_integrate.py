@@ -35,7 +35,7 @@ class Rig:
         self.scene, self.part = s, part
         self.own, self.estimate = s.own.copy(), np.zeros((len(s.own), 0))
         plant = coupled_units.constants(coupled_units.Params(), s.consists)
-        self.loop = integrate.Loop(constants, none.Constants(), plant)
+        self.loop = integrate.Inner(constants, none.Constants(), plant)
         self.air = integrate.Air(np.zeros((len(s.links.sender), part.MESSAGE)), live, False, 0.0)
         self.work = integrate.scratch(self.own, self.estimate, len(s.trains), none.CORRECTIONS, part.MESSAGE)
         self.extremes = Extremes.fresh(len(s.trains), len(s.own), len(part.WATCHED))
