@@ -148,7 +148,7 @@ def test_follows_the_system_and_the_button(page, dark):
 
 
 def test_a_million_rows_are_drawn_and_moved_quickly(tmp_path):
-    sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
+    sys.path.insert(0, str(Path(__file__).parents[1] / "unit" / "report"))
     from test_report import made_up
 
     page = report(made_up(tmp_path / "run", 250, 4000))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -134,20 +134,25 @@ def fit(axes: Axes) -> None:
     values = values[np.isfinite(values)]
     if not len(values):
         return
-    low, high = float(values.min()), float(values.max())
-    reach = FAR * max(high - low, 0.02 * max(abs(low), abs(high)))
-    at = sorted({float(np.ravel(line.get_ydata())[0]) for line in bounds})
-    below, above = [v for v in at if v < low - reach], [v for v in at if v > high + reach]
+    at = {float(np.ravel(line.get_ydata())[0]) for line in bounds}
+    below, above = far(values, at)
     if not below and not above:
         return
-    near = [v for v in at if v not in below and v not in above]
-    low, high = min([low, *near]), max([high, *near])
+    near = at - {*below, *above}
+    low, high = min([float(values.min()), *near]), max([float(values.max()), *near])
     spare = max(high - low, 1e-9)
     axes.set_ylim(low - (0.15 if below else 0.06) * spare, high + (0.15 if above else 0.06) * spare)
     for found, arrow, place, side in ((above, "↑", 0.97, "top"), (below, "↓", 0.03, "bottom")):
         if found:
             words = f"{arrow} bound {', '.join(f'{v:.4g}' for v in found)}"
             axes.text(0.995, place, words, transform=axes.transAxes, ha="right", va=side, fontsize=6.5, color=GREY, bbox=PAPER)
+
+
+def far(values: Floats, bounds: Collection[float]) -> tuple[list[float], list[float]]:
+    """Which bounds lie so far below and above finite ``values`` that they would squeeze them, each ascending."""
+    low, high = float(values.min()), float(values.max())
+    reach = FAR * max(high - low, 0.02 * max(abs(low), abs(high)))
+    return sorted(v for v in bounds if v < low - reach), sorted(v for v in bounds if v > high + reach)
 
 
 def time_axis(axes: Sequence[Axes], first: float, last: float, clock: bool) -> None:

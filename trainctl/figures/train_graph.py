@@ -40,13 +40,24 @@ def train_graph(drawn: Drawn) -> Figure:
     return _coming_and_going(drawn) if drawn.known.traffic else _on_tracks(drawn)
 
 
+def to_reference(drawn: Drawn) -> tuple[Floats, bool]:
+    """Positions of all rows relative to the reference [m]; of a crowd, whether it is one, what each train gained since its start.
+
+    No one tells the lines of a crowd apart where they are, but who gains on whom.
+    """
+    position, reference = drawn.trains.column("position_m"), drawn.known.reference
+    if reference is None:
+        return position, False
+    relative = position - leader_over(reference, drawn.trains.column("time_s"))[0]
+    if len(drawn.trains.names) <= NUMBERED:
+        return relative, False
+    return relative - np.repeat(relative[drawn.trains.first[:-1]], np.diff(drawn.trains.first)), True
+
+
 def _on_tracks(drawn: Drawn) -> Figure:
     reference = drawn.known.reference
     time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
-    relative = position - (0.0 if reference is None else leader_over(reference, time)[0])
-    crowd = reference is not None and len(drawn.trains.names) > NUMBERED
-    if crowd:  # no one tells its lines apart where they are, but who gains on whom
-        relative = relative - np.repeat(relative[drawn.trains.first[:-1]], np.diff(drawn.trains.first))
+    relative, crowd = to_reference(drawn)
     bundle = crowd or (reference is not None and np.ptp(relative) < BUNDLE * np.ptp(position))
     heights = {} if reference is None else {"height_ratios": [1, 2] if bundle else [1, 1]}
     figure, axes = style.panels(1 if reference is None else 2, drawn.width, 60.0, **heights)
@@ -129,7 +140,7 @@ def _marks(axes: list[Axes], found: list[Corridor], drawn: Drawn, kind: str) -> 
             if name in corridor.distance:
                 at = float(np.interp(event["time_s"], time[rows_of[name]], corridor.distance[name] / 1000))
                 if np.isfinite(at):
-                    panel.plot(event["time_s"], at, color=drawn.colour[name], markeredgewidth=0.5, zorder=4, **look)
+                    panel.plot(event["time_s"], at, color=drawn.colour[name], markeredgewidth=0.5, zorder=6, **look)
     return [Line2D([], [], color=style.GREY, markeredgewidth=0.5, label=f"{words} ({len(events)})", **look)] if events else []
 
 
@@ -143,7 +154,7 @@ class Plan(NamedTuple):
 
 def plans(drawn: Drawn, corridor: Corridor) -> dict[str, Plan]:
     """The timetable of the trains of a corridor, from stops.parquet; empty without one."""
-    stops = drawn.run.table("stops", missing_is_empty=True)
+    stops = drawn.run.stops
     if not len(stops):
         return {}
     at_of = {place.name: place.at_m / 1000 for place in corridor.places if place.kind == "stop"}
@@ -182,7 +193,7 @@ def numbered_at(distance: Floats, k: int) -> int:
     """Row at which the number of the k-th train stands on its line; those of trains that run close together one after the other."""
     some = np.flatnonzero(np.isfinite(distance))
     way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(distance[some])))])  # where a train stands, marks and places stand too
-    return int(some[np.searchsorted(way, (0.12 + 0.1 * (k % 5)) * way[-1]).clip(0, len(some) - 1)])
+    return int(some[np.searchsorted(way, (0.25 + 0.1 * (k % 5)) * way[-1]).clip(0, len(some) - 1)])
 
 
 def _number(panel: Axes, lines: dict[str, tuple[Floats, Floats]], drawn: Drawn) -> None:

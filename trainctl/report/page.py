@@ -125,6 +125,7 @@ def page(run: Run, *, clock: bool = False, kmh: bool = False) -> str:
         "about": _about(drawn),
         "verdict": _outcome(drawn.run) + _verdict(values, drawn.run) + _not_followed(drawn.run),
         "bounds": _bounds(values),
+        "unbounded": "" if _margins(values) else "hidden",
         "figures": _figures(values),
         "origin": escape(drawn.origin),
         "cite": _cited(drawn),
@@ -200,7 +201,9 @@ def _not_followed(run: Run) -> str:
     """What the files of a SUMO configuration say and the run did not do, one line each."""
     lines = [str(e["what"]) for e in run.events if e["kind"] == "not_followed"]
     rows = "".join(f"<li>{escape(line)}</li>" for line in lines)
-    summary_line = f"<summary>{len(lines)} things in SUMO's files that are not followed as they stand</summary>"
+    summary_line = (
+        f"<summary>{len(lines)} {'thing' if len(lines) == 1 else 'things'} in SUMO's files not followed as they stand</summary>"
+    )
     return f"<details class=left>{summary_line}<ul>{rows}</ul></details>" if lines else ""
 
 
@@ -234,7 +237,7 @@ def _bounds(values: Mapping[str, Any]) -> str:
 
 
 def three(value: float | str | None) -> str:
-    """A number to three digits, no exponent between a thousandth and a million; counts and whole seconds as they are."""
+    """Three significant digits, no exponent between a thousandth and a million; counts and whole seconds as they are."""
     if value is None:
         return "never"
     if isinstance(value, str):

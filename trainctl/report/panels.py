@@ -15,7 +15,7 @@ import numpy as np
 
 from trainctl.figures import style
 from trainctl.figures.corridors import Corridor, Place, corridors, crossovers
-from trainctl.figures.train_graph import NUMBERED, numbered_at, plans
+from trainctl.figures.train_graph import NUMBERED, numbered_at, plans, to_reference
 from trainctl.figures.trains import Drawn, in_formation
 from trainctl.metrics.driving import JOULES_PER_KWH
 from trainctl.metrics.values import at_least, at_most
@@ -46,7 +46,20 @@ def panels(drawn: Drawn) -> list[Panel]:
     found += [*_unit_forces(drawn), *_couplers(drawn), *_energy(drawn), *_events(drawn)]
     for one in found:
         one["traces"].sort(key=lambda trace: natural(str(trace.get("group", ""))))  # stable: bands stay under their lines
+        _set_aside(one)
     return [one for one in found if one["traces"]]
+
+
+def _set_aside(one: Panel) -> None:
+    """Mark the bounds of a panel that are so far from its data that they would squeeze them: ``far`` is -1 below and 1 above."""
+    lines = [trace["y"]["bdata"] for trace in one["traces"] if isinstance(trace["y"], dict)]
+    values = np.frombuffer(b"".join(map(base64.b64decode, lines)), "<f4").astype(float)
+    values = values[np.isfinite(values)]
+    if "log" in one or "least_range" in one or not len(values):
+        return
+    below, above = style.far(values, [bound["value"] for bound in one.get("bounds", ())])
+    for bound in one.get("bounds", ()):
+        bound["far"] = -1 if bound["value"] in below else int(bound["value"] in above)
 
 
 def natural(name: str) -> list[tuple[int, int, str]]:
@@ -97,14 +110,15 @@ def _train_graph(drawn: Drawn) -> Iterator[Panel]:
     on = track.astype(str).to_numpy()
     reference = drawn.known.reference
     kinds = [("graph", "Train graph", "position [km]")]
-    if reference is not None:
+    relative, crowd = to_reference(drawn)
+    if crowd:
+        kinds.append(("relative", "Gained on the reference since the start", "gained [km]"))
+    elif reference is not None:
         kinds.append(("relative", "Position relative to the reference", "x - x_r [km]"))
     for name, title, unit in kinds:
         traces: list[Trace] = []
         for train, rows in drawn.trains.slices():
-            value = position[rows] / 1000
-            if name == "relative" and reference is not None:
-                value = value - leader_over(reference, time[rows])[0] / 1000
+            value = (position if name == "graph" else relative)[rows] / 1000
             for k, place in enumerate(tracks):
                 here = on[rows] == place
                 if not here.any():

@@ -98,25 +98,29 @@ def side_by_side(drawn: Sequence[Drawn], labels: Sequence[str], paint: Callable[
             axes.tick_params(labelbottom=True)
     for axes in list(grid.flat)[len(drawn) :]:
         axes.remove()
-    style.legend(figure, "double")
+    if len({len(one.names) for one in drawn}) > 1:  # a train has not the same colour in all panels: only what all have in common
+        found = [handle for axes in figure.axes for handle in axes.get_legend_handles_labels()[0]]
+        common = {str(handle.get_label()): handle for handle in found if str(handle.get_label()) in style.COMMON}
+        style.legend(figure, "double", list(common.values()))
+    else:
+        style.legend(figure, "double")
     return figure
 
 
 def _relative(axes: Axes, drawn: Drawn) -> None:
     time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
     reference = drawn.known.reference
-    for name, rows in drawn.trains.slices():
+    for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
         at = 0.0 if reference is None else leader_over(reference, time[rows])[0]
-        style.draw(axes, time[rows], (position[rows] - at) / 1000, label=f"train {name}", **drawn.look[name])
+        style.draw(axes, time[rows], (position[rows] - at) / 1000, label=label, **drawn.look[name])
     axes.set_ylabel("position [km]" if reference is None else r"$x_i - x_r$ [km]")
 
 
 def _errors(axes: Axes, drawn: Drawn) -> None:
     links = drawn.links
-    for (name, rows), colour in zip(links.slices(), style.colours(len(links.names)), strict=True):
-        style.draw(
-            axes, links.column("time_s")[rows], np.abs(links.column("error_m")[rows]).clip(1e-4), color=colour, label=f"link {name}"
-        )
+    looks = zip(links.slices(), style.colours(len(links.names)), style.labels(links.names, "link "), strict=True)
+    for (_, rows), colour, label in looks:
+        style.draw(axes, links.column("time_s")[rows], np.abs(links.column("error_m")[rows]).clip(1e-4), color=colour, label=label)
     if not links.names:
         axes.text(0.5, 0.5, "no links", transform=axes.transAxes, ha="center", color=style.GREY)
     axes.set_ylabel(r"$|x_{ij} - d_{ij}|$ [m]")

@@ -59,7 +59,7 @@ class StopElement(NamedTuple):
     position_m: float  # its front, from the beginning of the edge
     duration_s: float  # at least
     until_s: float | None  # not before
-    name: str  # of the train stop, or ""
+    name: str  # of the train stop, its id if it has none, or ""
     first: int  # number in the route of the earliest edge it may be on
     pass_mps: float  # it does not stand, but passes with at most this speed; 0: it stands
     parks: bool  # it leaves the track meanwhile
@@ -295,7 +295,7 @@ def _departure(
             position_m=place.position_m,
             duration_s=max(seconds(stop.get("duration", "0")), 0.0),
             until_s=seconds(stop.get("until", "")) if stop.get("until") else None,
-            name=next((stop.get(tag, "") for tag in PLACES if stop.get(tag)), ""),
+            name=_called(stop, elements),
             first=at,
             pass_mps=float(stop.get("speed", "0")),
             parks=stop.get("parking", "false").lower() in YES or stop.get("parkingArea") is not None,
@@ -346,6 +346,12 @@ def _departure(
         speed_mps = 0.0
     like = speed if speed in ("avg", "last") else ""
     return departure._replace(position_m=position, arrival_m=arrival_m, speed_mps=speed_mps, like=like), wrong
+
+
+def _called(stop: Element, elements: Elements) -> str:
+    """Name of the place a train stops at, or its id where it has none; "" on a lane."""
+    place = next((stop.get(tag, "") for tag in PLACES if stop.get(tag)), "")
+    return elements.places[place].get("name") or place if place in elements.places else place
 
 
 def _planned(stop: Element, late: float | None) -> float | None:

@@ -128,6 +128,14 @@ def test_lines_stand_by_number_and_a_link_goes_with_its_train_behind(finished):
     assert {p["name"] for p in shown["graph"]["places"]} == {"emu_leave", "emu_join"}
 
 
+def test_bounds_far_from_the_data_are_set_aside(finished):
+    wide = {"bounds.input_lower_mps2": -200.0, "bounds.input_upper_mps2": 200.0}
+    own = finished("fully_distributed", "numeric", **{"run.duration_s": 60, **wide})
+    shown = {panel["id"]: panel for panel in panels(drawable(own))}
+    assert [(b["value"], b["far"]) for b in shown["inputs"]["bounds"]] == [(-200.0, -1), (200.0, 1)]
+    assert [(b["value"], b["far"]) for b in shown["speeds"]["bounds"]] == [(75.0, 0), (85.0, 0)]
+
+
 def test_hours_and_kilometres_per_hour_by_option(run):
     data = data_of(page(run, clock=True, kmh=True))
     assert (data["clock"], data["per_mps"], data["speed_unit"]) == (True, 3.6, "km/h")

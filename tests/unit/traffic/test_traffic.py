@@ -222,6 +222,12 @@ for _ in range(900):
         assert ours == [[lane, pytest.approx(end), duration, until] for lane, end, duration, until in stops], d.id
 
 
+def test_a_stop_is_called_by_the_name_of_its_place(files: Files) -> None:
+    demand = '<vehicle id="v" type="t" depart="0" route="main"><stop trainStop="mid" duration="5"/><stop busStop="east"/></vehicle>'
+    (train,) = files.read(demand, stops=STOPS.replace('id="mid"', 'id="mid" name="Midway"')).departures
+    assert [stop.name for stop in train.stops] == ["Midway", "east"]
+
+
 def test_a_train_with_a_line_is_not_lost(files: Files) -> None:
     (train,) = files.read('<vehicle id="v" type="t" depart="0" route="main" line="S1" arrivalPos="-20"><stop trainStop="mid" '
                           'duration="10" parking="true" tripId="z"/></vehicle>').departures  # fmt: skip

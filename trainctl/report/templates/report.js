@@ -63,9 +63,9 @@
       font: { color: css("--ink"), size: small ? 10 : 12, family: "system-ui, DejaVu Sans, sans-serif" }, hovermode: "closest", hoverdistance: -1,
       hoverlabel: { bgcolor: css("--paper"), bordercolor: grid, font: { color: css("--ink") }, align: "left" },
       showlegend: false, xaxis: { ...axis, title: { text: data.clock ? "time [h:min]" : "time [s]", standoff: 4 }, range: range.slice(), ...(data.clock ? ticks(range) : {}) }, yaxis: y, dragmode: small ? false : "zoom",
-      shapes: [...bounds.map((b) => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: b.value, y1: b.value, line: { color: b.dash === "dot" ? css("--ink") : css("--bad"), width: 1.2, dash: b.dash } })),
+      shapes: [...bounds.filter((b) => !b.far).map((b) => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: b.value, y1: b.value, line: { color: b.dash === "dot" ? css("--ink") : css("--bad"), width: 1.2, dash: b.dash } })),
         ...places.map((p) => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: p.value, y1: p.value, layer: "below", line: { color: place_colour(p), width: p.stop ? 1 : 0.8, dash: p.stop ? "solid" : "dot" } }))],
-      annotations: [...bounds.map((b) => ({ xref: "paper", x: 1, xanchor: "right", y: panel.log ? Math.log10(b.value) : b.value, yanchor: "bottom", showarrow: false, text: `${b.name} ${+b.value.toPrecision(4)}`, font: { size: 10, color: b.dash === "dot" ? css("--ink") : css("--bad") } })),
+      annotations: [...bounds.map((b) => ({ xref: "paper", x: 1, xanchor: "right", showarrow: false, ...(b.far ? { yref: "paper", y: b.far > 0 ? 1 : 0, yanchor: b.far > 0 ? "top" : "bottom" } : { y: panel.log ? Math.log10(b.value) : b.value, yanchor: "bottom" }), text: `${b.far ? (b.far > 0 ? "↑ " : "↓ ") : ""}${b.name} ${+b.value.toPrecision(4)}`, font: { size: 10, color: b.dash === "dot" ? css("--ink") : css("--bad") } })),
         ...places.map((p) => ({ xref: "paper", x: 0, xanchor: "left", y: p.value, yanchor: "bottom", showarrow: false, text: p.stop ? `<b>${safe(p.name)}</b>` : safe(p.name), font: { size: 10, color: place_colour(p) } }))],
     };
   }
@@ -73,7 +73,7 @@
 
   // plotly leaves shapes out of the automatic range: an unseen pair of points at the bounds brings them in
   function anchors(panel) {
-    const values = (panel.bounds || []).map((b) => b.value);
+    const values = (panel.bounds || []).filter((b) => !b.far).map((b) => b.value);
     if (panel.least_range && !values.length) values.push(-panel.least_range / 2, panel.least_range / 2);
     return values.length ? [{ type: "scatter", mode: "markers", x: values.map(() => whole[0]), y: values, marker: { opacity: 0, size: 1 }, hoverinfo: "skip", showlegend: false }] : [];
   }
@@ -200,6 +200,14 @@
     return { x: blend(position), side: blend(lateral), v: speed[a] };
   }
 
+  // words are left out where they would lie on others
+  let taken = [];
+  function write(text, x, y) {
+    const width = pen.measureText(text).width, left = x - (pen.textAlign === "center" ? width / 2 : 0);
+    if (taken.some(([l, r, at]) => left < r + 3 && left + width > l - 3 && Math.abs(at - y) < 12)) return;
+    taken.push([left, left + width, y]); pen.fillText(text, x, y);
+  }
+
   // a net of any shape: true to scale, unless it is so long and flat that nothing could be told apart
   const box = map ? [0, 1].map((d) => { let low = Infinity, high = -Infinity; for (const v of map[d]) { if (v < low) low = v; if (v > high) high = v; } return [low, high]; }) : null;
   function paint_map(share, width) {
@@ -232,7 +240,7 @@
       pen.fillStyle = shown(film.trains[k].color); pen.strokeStyle = css("--panel"); pen.lineWidth = 1.5;
       pen.beginPath(); pen.arc(x, y, 7, 0, 7); pen.fill(); pen.stroke();
       if (count <= 30 || zoom > 4) {
-        pen.fillStyle = css("--ink"); pen.font = "bold 12px system-ui, DejaVu Sans, sans-serif"; pen.textAlign = "left"; pen.fillText(film.trains[k].name, x + 9, y + (k % 2 ? 14 : -12));
+        pen.fillStyle = css("--ink"); pen.font = "bold 12px system-ui, DejaVu Sans, sans-serif"; pen.textAlign = "left"; write(film.trains[k].name, x + 9, y + (k % 2 ? 14 : -12));
       }
     });
     let step = Math.pow(10, Math.floor(Math.log10(width / sx / 4)));
@@ -250,6 +258,7 @@
     }
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.clearRect(0, 0, width, height);
+    taken = [];
     if (map) { paint_map(share, width); return; }
     const here = film.trains.map((_, k) => place(k, share));
     const present = here.filter((p) => p);
@@ -306,8 +315,8 @@
       pen.beginPath(); pen.roundRect(x - length, y - 6, length, 12, 3); pen.fill(); pen.stroke();
       pen.beginPath(); pen.arc(x, y, 7, 0, 7); pen.fill(); pen.stroke();
       if (count <= 30 || +at("zoom").value > 2) {
-        pen.fillStyle = ink; pen.font = "bold 13px system-ui, DejaVu Sans, sans-serif"; pen.textAlign = "left"; pen.fillText(train.name, x + 10, y - 9);
-        pen.font = "11px system-ui, DejaVu Sans, sans-serif"; pen.fillStyle = soft; pen.textAlign = "center"; pen.fillText((data.per_mps * p.v).toFixed(1) + " " + data.speed_unit, x, y + 16);
+        pen.fillStyle = ink; pen.font = "bold 13px system-ui, DejaVu Sans, sans-serif"; pen.textAlign = "left"; write(train.name, x + 10, y - 9);
+        pen.font = "11px system-ui, DejaVu Sans, sans-serif"; pen.fillStyle = soft; pen.textAlign = "center"; write((data.per_mps * p.v).toFixed(1) + " " + data.speed_unit, x, y + 16);
       }
     });
     pen.restore();
