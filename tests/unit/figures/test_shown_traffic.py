@@ -7,6 +7,7 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
@@ -230,7 +231,12 @@ def test_a_station_near_the_entry_is_not_overrun(tmp_path, place):
     (tmp_path / "merging").mkdir()
     for path in MERGING.glob("merging/*"):
         text = path.read_text().replace('edge="trunk" endPos="8900"', f'edge="from_west" endPos="{place}"')
-        (tmp_path / "merging" / path.name).write_text(text.replace('depart="165"', 'depart="2"'))
+        (tmp_path / "merging" / path.name).write_text(text)
+    routes = tmp_path / "merging" / "merging.rou.xml"
+    root = ElementTree.parse(routes).getroot()
+    root.find(".//*[@depart='165']").set("depart", "2")
+    root[:] = sorted(root, key=lambda element: float(element.get("depart", element.get("begin", -1))))  # else SUMO leaves it out
+    ElementTree.ElementTree(root).write(routes)
     (tmp_path / "s.toml").write_text((MERGING / "merging.toml").read_text())
     done = run(open_scenario(str(tmp_path / "s.toml"), {"run.duration_s": 160}), tmp_path / "r", "numeric")
     (stop,) = [e for e in done.events if e["kind"] == "stop_reached"]
