@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -230,6 +231,9 @@ def test_a_station_near_the_entry_is_not_overrun(tmp_path, place):
     (tmp_path / "merging").mkdir()
     for path in MERGING.glob("merging/*"):
         text = path.read_text().replace('edge="trunk" endPos="8900"', f'edge="from_west" endPos="{place}"')
+        early = re.search(r' *<vehicle id="stopping".*?</vehicle>\n', text, re.S)
+        if early:  # a route file goes by departure times
+            text = text.replace(early[0], "").replace('    <flow id="branch"', early[0] + '    <flow id="branch"')
         (tmp_path / "merging" / path.name).write_text(text.replace('depart="165"', 'depart="2"'))
     (tmp_path / "s.toml").write_text((MERGING / "merging.toml").read_text())
     done = run(open_scenario(str(tmp_path / "s.toml"), {"run.duration_s": 160}), tmp_path / "r", "numeric")
