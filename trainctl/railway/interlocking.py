@@ -67,7 +67,7 @@ def order(state: State) -> Order:
 def request(
     zones: Zones, state: State, row: Ints, s: Floats, length: Floats, present: Bools, reach: Floats,
     clearance: float = 0.0, entering: Bools | None = None, stop: Floats | None = None, stands: Bools | None = None,
-    ordered: Sequence[tuple[int, int, int]] = (),
+    ordered: Sequence[tuple[int, int, int]] = (), keeps: Bools | None = None,
 ) -> tuple[State, Held, list[Decision]]:  # fmt: skip
     """Requests of all trains at one instant.
 
@@ -91,6 +91,8 @@ def request(
         Trains that stand there and are not to go on yet.
     ordered : sequence of tuple
         Train, a row of its way, and the train that must have passed there first.
+    keeps : ndarray, shape (n,), optional
+        Of those that ask to enter, who keeps its place at joins; default all.
 
     Returns
     -------
@@ -152,8 +154,8 @@ def request(
                 for key in [key for key, k in passed.items() if key[0] == i and k > row[i]]:
                     found.pop(key, None)
                     passed.pop(key, None)
+            queues = {e: [j for j in queue if (j, e) in joins] for e, queue in queues.items()}
     order = [key for key in order if key in granted]
-    queues = {e: [i for i in queue if (i, e) in joins] for e, queue in queues.items()}
     new = granted.keys() - {(i, e) for i, e, _ in state["stretches"]}
     held, waiting, stuck = Index(zones, trains), Index(zones, trains), Index(zones, trains)
     for key in order:
@@ -244,7 +246,7 @@ def request(
     barred = outside & (room <= 0.0)
     queues = {e: [i for i in queue if not barred[i]] for e, queue in queues.items()}
     said += _turns(trains, queues, joins, _open(_inside(joins, barred), stretches, granted), outside)
-    _keep_places(trains, queues, joins, outside, room, zone, by)
+    _keep_places(trains, queues, joins, outside, outside if keeps is None else keeps, room, zone, by)
     after = zones.following[row]
     for i in np.flatnonzero(present & (after >= 0) & (begin[after] - s < reach)).tolist():  # not requested: it stands before
         k = _limit(trains, granted, i)
@@ -297,8 +299,8 @@ def _inside(joins: dict[tuple[int, int], int], without: Bools) -> dict[tuple[int
 
 
 def _keep_places(
-    trains: Trains, queues: dict[int, list[int]], joins: dict[tuple[int, int], int], outside: Bools, room: Floats, zone: Ints,
-    by: Ints,
+    trains: Trains, queues: dict[int, list[int]], joins: dict[tuple[int, int], int], outside: Bools, keeps: Bools,
+    room: Floats, zone: Ints, by: Ints,
 ) -> None:  # fmt: skip
     """Hold trains before the joins at which one that is to enter goes first."""
     for e, queue in queues.items():
@@ -307,7 +309,7 @@ def _keep_places(
             k = joins[i, e]
             away = trains.distance(i, k)
             if outside[i]:
-                first.append(i)
+                first += [i] if keeps[i] else []
             elif 0.0 <= away < room[i]:
                 before = [j for j in first if trains.track(j, joins[j, e]) != trains.track(i, k)]
                 if before:

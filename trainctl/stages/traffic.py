@@ -43,6 +43,7 @@ class State(NamedTuple):
     stopping: Bools  # for its next stop
     parked: Bools  # off the track, at a stop
     waits_for: Ints  # train that each is held by at a switch, -1 if none
+    kept_out: Ints  # train that keeps each from entering, -1 if none
     requests: interlocking.State
 
     @property
@@ -108,7 +109,7 @@ class Traffic:
             came=np.full(n, self.roster.placed), entering=np.zeros(n, bool), left=np.zeros(n, bool),
             next_stop=np.zeros(n, np.int64), stands_since=np.full(n, np.nan), stands_until=np.full(n, np.nan),
             late=np.full(n, np.nan), stopping=np.zeros(n, bool), parked=np.zeros(n, bool),
-            waits_for=np.full(n, -1), requests=interlocking.none(),
+            waits_for=np.full(n, -1), kept_out=np.full(n, -1), requests=interlocking.none(),
         )  # fmt: skip
 
     def step(
@@ -189,7 +190,8 @@ class Traffic:
         """Trains of those that are ``due`` whose place is clear, with the speed they come with [m/s]; who keeps out the others."""
         asking = np.zeros(len(speed), bool)
         asking[due] = True
-        s, held = self._request(t, ways, here, self._reach(speed) if reach is None else reach, asking, s)
+        stands = (s.kept_out >= 0) & (np.abs(speed[s.kept_out]) < STANDS_MPS)  # who stands may wait for it in turn
+        s, held = self._request(t, ways, here, self._reach(speed) if reach is None else reach, asking, asking & ~stands, s)
         s = s._replace(parked=s.parked.copy(), stands_until=s.stands_until.copy())
         present, came, entering = here.present.copy(), s.came.copy(), s.entering.copy()
         come: list[tuple[int, float]] = []
@@ -211,7 +213,9 @@ class Traffic:
                 continue
             came[i], entering[i], speed[i] = True, True, v
             come.append((i, v))
-        return s._replace(came=came, entering=entering), held, tuple(come), kept_out
+        keeping = np.full(len(speed), -1)
+        keeping[list(kept_out)] = list(kept_out.values())
+        return s._replace(came=came, entering=entering, kept_out=keeping), held, tuple(come), kept_out
 
     def _entering_speed(self, i: int, ways: Ways, here: Seen, speed: Floats, view: View, s: State) -> float | None:
         """Speed with which a train can enter safely; None if it has to wait. ``view`` is that with the train at its place."""
@@ -399,14 +403,16 @@ class Traffic:
                 found.append((then, int(rows[1][0]), first))
         return found
 
-    def _request(self, t: float, ways: Ways, seen: Seen, reach: Floats, entering: Bools, s: State) -> tuple[State, Held]:
+    def _request(
+        self, t: float, ways: Ways, seen: Seen, reach: Floats, entering: Bools, keeps: Bools, s: State
+    ) -> tuple[State, Held]:
         """Let every train request what lies within its reach; ``entering`` (n,) are those that ask to enter the net."""
         if self.ways is not ways:  # they changed
             self.ways, self.zones = ways, zones.of(ways, self.net)
         requests, held, said = interlocking.request(
             self.zones, s.requests, seen.row, seen.position, self.length, seen.present, reach,
             self.p.supervision.margin_m + DRIVER_MARGIN_M, entering, self._own_stops(s), s.standing,
-            self._ordered(t, ways, seen, s),
+            self._ordered(t, ways, seen, s), keeps,
         )  # fmt: skip
         ids, edges = self.p.scenario.ids, self.p.rails.edges
         for one in said:

@@ -180,6 +180,8 @@ def test_a_train_that_waits_to_enter_keeps_its_turn_at_the_join_and_who_comes_la
     held, said = yard.now(entering=entering)
     assert (held.room[0], held.by[0], held.zone[0]) == (350.0, 1, MERGE.number["m"])
     assert [(d.train, d.by, d.join) for d in said] == [(0, 1, True)]
+    # Unless one that stands keeps it out, which perhaps waits for it.
+    assert np.isinf(yard.now(entering=entering, keeps=np.zeros(3, bool))[0].room[0])
     yard.present[1] = True
     assert np.isinf(yard.now()[0].room).all()  # it has come: the one behind follows
 
@@ -219,6 +221,20 @@ def test_a_request_ends_at_the_own_stop_and_what_lies_ahead_of_a_stand_is_given_
         assert held.by.tolist() == [1, -1]  # now it comes in its turn
         yard.put(1, "d", 200)
         assert np.isinf(yard.now()[0].room).all()
+
+
+def test_trains_that_stand_at_once_give_back_one_after_another():
+    net = railway(
+        {"a": 900, "e": 900, "m": 1000, "s": 900, "b": 900, "c": 900, "S": 900, "M": 1000, "d": 900},
+        [("a", "m"), ("e", "m"), ("m", "s"), ("s", "b"), ("c", "S"), ("S", "M"), ("M", "d")], twins=[("s", "S"), ("m", "M")],
+    )  # fmt: skip
+    yard = Yard(net, [("a m s b", "a", 880, 100), ("e m s b", "e", 870, 100), ("c S M d", "c", 800, 100)], clearance=10.0)
+    yard.reach[:2] = 300.0
+    held, _ = yard.now()
+    assert np.isinf(held.room[:2]).all() and yard.state["joins"] == {str(net.number["m"]): [0, 1]}
+    yard.reach[2] = 300.0
+    held, _ = yard.now(stop=np.array([880.0, 870.0, np.inf]), stands=np.array([True, True, False]))
+    assert np.isinf(held.room[2]) and yard.state["joins"] == {}
 
 
 def test_a_join_beyond_the_own_stop_is_not_requested():
