@@ -149,7 +149,8 @@ def _blind(self, speed, acceleration, around, traffic, formed, commanded):
 
 def _let_in(self, t, ways, here, speed, s, due, reach=None):
     """Everybody comes at his time, whoever has the track."""
-    s, held = self._request(t, ways, here, speed, np.zeros(len(speed), bool), s)
+    nobody = np.zeros(len(speed), bool)
+    s, held = self._request(t, ways, here, speed, nobody, nobody, s)
     come = tuple((i, 35.0) for i in due)
     came = s.came.copy()
     for i, v in come:
