@@ -162,3 +162,10 @@ def renamed(log: pd.DataFrame, rng: np.random.Generator) -> Mutation:
 
 
 MUTATIONS = {f.__name__: f for f in (delay, order, stop, shift, dropped, doubled, units, renamed)}
+
+
+def one_late_one_missing(frame: pd.DataFrame, seconds: float) -> pd.DataFrame:
+    """A log of ``merging`` in which fast.1 runs so much later from its 100th row on, and fast.2 is missing."""
+    rows = frame[frame.id == "fast.1"]
+    late = later(rows, rows.time.iloc[100], seconds, True)
+    return ordered([frame[~frame.id.isin(["fast.1", "fast.2"])], late], frame.time.max())

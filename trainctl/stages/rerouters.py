@@ -21,7 +21,7 @@ class Rerouters:
 
     def __init__(self, p: Model, journal: Journal) -> None:
         self.p, self.journal, self.closings = p, journal, p.roster.closings
-        self.at = {p.rails.index[e] for c in self.closings for e in c.at if e in p.rails.index}
+        self.at = np.unique([p.rails.index[e] for c in self.closings for e in c.at if e in p.rails.index])
 
     def initial(self) -> Ints:
         """Edge on which every train has found no way round, shape (n,); -1: none."""
@@ -54,11 +54,11 @@ class Rerouters:
         list of (int, tuple of str)
             Train and edges from the one it is on, internal ones included.
         """
-        if not self.at:
+        if not len(self.at):
             return refused, []
         now = np.where(seen.present, seen.edge, -1)
         refused, routes = np.where(now == refused, refused, -1), []
-        for i in np.flatnonzero((now != refused) & np.isin(now, list(self.at))).tolist():
+        for i in np.flatnonzero((now != refused) & np.isin(now, self.at)).tolist():
             edges = () if i in busy else self._around(t, i, seen, ways, float(speed[i]))
             if edges is None:
                 refused[i] = now[i]

@@ -29,9 +29,7 @@ pytest_plugins = ["pytester"]
 def pair(finished, tmp_path_factory):
     """A log, and one with a late train, a missing one, and a column in other units."""
     place, frame = tmp_path_factory.mktemp("pair"), mutations.read(finished("merging").folder)
-    rows = frame[frame.id == "fast.1"]
-    late = mutations.later(rows, rows.time.iloc[100], 7.0, True)
-    other = mutations.ordered([frame[~frame.id.isin(["fast.1", "fast.2"])], late], frame.time.max())
+    other = mutations.one_late_one_missing(frame, 7.0)
     other["speed"] *= 3.6
     return mutations.write(frame, place / "a.xml"), mutations.write(other, place / "b.xml")
 
@@ -225,9 +223,7 @@ def test_the_example_of_the_page_is_what_is_printed(finished, tmp_path, monkeypa
     from trainctl.cli import program as cli
 
     frame = mutations.read(finished("merging").folder)
-    rows = frame[frame.id == "fast.1"]
-    late = mutations.later(rows, rows.time.iloc[100], 20.0, True)
-    other = mutations.ordered([frame[~frame.id.isin(["fast.1", "fast.2"])], late], frame.time.max())
+    other = mutations.one_late_one_missing(frame, 20.0)
     a, b = mutations.write(frame, tmp_path / "a.xml"), mutations.write(other, tmp_path / "b.xml")
     (tmp_path / "t.toml").write_text("absolute = 1.0\ntime_s = 5.0\n")
     monkeypatch.setattr("sys.argv", ["trainctl", "diff", str(a), str(b), "--tolerances", str(tmp_path / "t.toml")])

@@ -14,13 +14,6 @@ from trainctl.stages.traffic import Traffic
 
 
 @pytest.fixture(scope="module")
-def line(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("line")
-    nets.separate(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def p(line):
     return prepared(line, "fully_distributed")
 

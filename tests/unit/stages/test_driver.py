@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import nets
 import numpy as np
 import pytest
 from staged import Told, around, chained, prepared, target, view
@@ -14,13 +13,6 @@ from trainctl.stages.convoys import Convoys
 from trainctl.stages.driver import HASTE, ROOM_FOR_HASTE
 from trainctl.stages.traffic import Traffic, nothing
 from trainctl.topology.convoys import closing_speed
-
-
-@pytest.fixture(scope="module")
-def line(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("line")
-    nets.separate(folder)
-    return folder
 
 
 class Cab:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import nets
 import numpy as np
 import pytest
 from staged import Told, prepared, target, view
@@ -15,13 +14,6 @@ from trainctl.stages.driver import Driven
 from trainctl.stages.protect import Protect
 
 N = 6
-
-
-@pytest.fixture(scope="module")
-def line(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("line")
-    nets.separate(folder)
-    return folder
 
 
 @pytest.mark.parametrize(("lower", "upper", "emergency", "maximum"), [(-1.0, 1.0, 1.065, 1.0), (-3.0, 2.0, 3.065, 2.0)])

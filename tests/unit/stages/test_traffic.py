@@ -12,13 +12,6 @@ from trainctl.stages.traffic import SOON_S, Traffic
 
 
 @pytest.fixture(scope="module")
-def line(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("line")
-    nets.separate(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def stops(tmp_path_factory):
     """One train that stops twice."""
     folder = tmp_path_factory.mktemp("stops")
