@@ -136,10 +136,11 @@ class References(NamedTuple):
 
     def leader(self, t: float) -> Floats:
         """Position, speed, acceleration and jerk at ``t``: (4,) where all follow one reference, else of each train (4, n)."""
-        out = np.empty((len(self.breaks), 4))
-        for r in range(len(self.breaks)):
-            evaluate(self.breaks[r], self.position[r], t, t, out[r])
-        return out[0] if len(out) == 1 else np.ascontiguousarray(out[self.of].T)
+        if len(self.breaks) == 1:
+            out = np.empty(4)
+            evaluate(self.breaks[0], self.position[0], t, t, out)
+            return out
+        return _leaders(self, t)
 
 
 @njit(cache=True)
@@ -158,6 +159,19 @@ def evaluate(breaks: Floats, position: Floats, t: float, inside: float, out: Flo
                 factor *= p - q
             value = value * s + factor
         out[d] = value
+
+
+@njit(cache=True)
+def _leaders(references: References, t: float) -> Floats:
+    """Position, speed, acceleration and jerk of every train's reference at ``t``, shape (4, n)."""
+    each = np.empty((len(references.breaks), 4))
+    for r in range(len(each)):
+        evaluate(references.breaks[r], references.position[r], t, t, each[r])
+    out = np.empty((4, len(references.of)))
+    for i in range(len(references.of)):
+        for d in range(4):
+            out[d, i] = each[references.of[i], d]
+    return out
 
 
 @njit(cache=True)

@@ -203,7 +203,8 @@ class Model:
         run, top = self.scenario.run, self.scenario.topology
         period = top.communication_period_s or run.control_period_s or run.step_s
         names = np.array([draws.word(name) for name in self.scenario.ids], np.int64)
-        return Radio(top.loss, round(top.delay_s / period), top.range_m or np.inf, run.seed or 0, names)
+        key = np.tile(np.array(draws.key(run.seed or 0), np.int64), (len(names), 1))
+        return Radio(top.loss, round(top.delay_s / period), top.range_m or np.inf, key, names)
 
     @property
     def spacing(self) -> convoys.Spacing:
