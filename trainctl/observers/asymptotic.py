@@ -43,9 +43,10 @@ import numpy as np
 from pydantic import Field
 
 from trainctl.carriages import Numbers, miscounted, spread
+from trainctl.contracts import Observer
 from trainctl.davis import running_resistance
 from trainctl.kernels import inlined
-from trainctl.signals import POSITION, SPEED, Bools, Consists, Floats, Ints, Observer, Scene, Table
+from trainctl.signals import POSITION, SPEED, Bools, Consists, Floats, Ints, Scene, Table
 
 if TYPE_CHECKING:
     from trainctl.observers import asymptotic

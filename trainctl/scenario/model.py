@@ -12,6 +12,7 @@ import numpy as np
 
 from sumo_net import Rails
 from trainctl import draws
+from trainctl.contracts import Observer, Plant
 from trainctl.davis import resistance
 from trainctl.plants import disturbance
 from trainctl.railway import signs, supervisor
@@ -19,21 +20,7 @@ from trainctl.railway.authority import DRIVER_MARGIN_M
 from trainctl.railway.signs import Signs
 from trainctl.scenario import limits, promise
 from trainctl.scenario.tables import Scenario, TrafficTable
-from trainctl.signals import (
-    POSITION,
-    SPEED,
-    Bounds,
-    Consists,
-    Floats,
-    Ints,
-    Links,
-    Observer,
-    Plant,
-    Reference,
-    Scene,
-    leader_at,
-    restrict,
-)  # fmt: skip
+from trainctl.signals import POSITION, SPEED, Bounds, Consists, Floats, Ints, Links, Reference, Scene, leader_at, restrict
 from trainctl.topology import convoys, graph
 from trainctl.topology.exchange import Radio
 
