@@ -24,7 +24,7 @@ def alone(monkeypatch):
 
     def here(todo, workers, scheduler):
         asked.append([job.number for job in todo])
-        yield from map(sweeping.simulate, reversed(todo))
+        yield from ((job, sweeping.simulate(job)) for job in reversed(todo))
 
     monkeypatch.setattr(sweeping, "_scattered", here)
     return asked
