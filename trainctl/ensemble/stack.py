@@ -63,6 +63,8 @@ def alone(p: Model) -> str | None:
         return "it has events on the way"
     if p.remembers:
         return "its law keeps a state of its own"
+    if p.has_units:
+        return "its trains are of units"
     if p.plant.noise_hold(p.plant_params) is not None:
         return "its plant has noise of its own"
     return None

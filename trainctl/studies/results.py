@@ -144,9 +144,8 @@ def write_results(found: Part, numbers: Sequence[int], path: Path) -> pd.DataFra
         columns[key] = _column([_plain(parameters.get(key)) for parameters in found.parameters])
     columns["status"], columns["failure"] = _column(list(found.status)), pa.array(found.failure, pa.string())
     columns |= {key: pa.array(found.counts[key], pa.int64(), from_pandas=True) for key in COUNTS}
-    columns |= {
-        key: pa.array(found.metrics[key], pa.float64(), from_pandas=True) for key in sorted(found.metrics) if key not in columns
-    }
+    metrics = sorted(key for key, column in found.metrics.items() if key not in columns and not np.isnan(column).all())
+    columns |= {key: pa.array(found.metrics[key], pa.float64(), from_pandas=True) for key in metrics}
     table = pa.table(columns).replace_schema_metadata({"schema_version": str(SCHEMA_VERSION), "table": "sweep"})
     new = path.with_suffix(".new")
     pq.write_table(table, new, compression="zstd")
