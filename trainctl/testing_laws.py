@@ -37,7 +37,7 @@ def check_sampled_law(law: Any, controller: dict[str, Any] | None = None, weight
     Parameters
     ----------
     law : module
-        What ``[controller] law`` would name, see ``trainctl.signals.SampledLaw``.
+        What ``[controller] law`` would name, see ``trainctl.contracts.SampledLaw``.
     controller : dict, optional
         Keys of ``[controller]``; default those of the law.
     weight : float

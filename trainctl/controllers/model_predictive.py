@@ -52,7 +52,7 @@ import numpy as np
 from pydantic import Field
 
 from trainctl.controllers import ahead, stated
-from trainctl.signals import SPEED, Bools, Bounds, Demand, Floats, Ints, Links, RememberingLaw, Scene, Table, Trains
+from trainctl.signals import SPEED, Bools, Bounds, Demand, Floats, Ints, Links, Scene, Table, Trains
 
 try:
     import daqp
@@ -60,6 +60,7 @@ except ModuleNotFoundError:  # an optional extra: without it the law is named, a
     daqp = None
 
 if TYPE_CHECKING:
+    from trainctl.contracts import RememberingLaw
     from trainctl.controllers import model_predictive
 
     module: RememberingLaw = model_predictive

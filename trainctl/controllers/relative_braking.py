@@ -44,9 +44,10 @@ import numpy as np
 from pydantic import Field
 
 from trainctl.controllers import ahead, stated
-from trainctl.signals import Bounds, Demand, Floats, Links, SampledLaw, Scene, Table, Trains
+from trainctl.signals import Bounds, Demand, Floats, Links, Scene, Table, Trains
 
 if TYPE_CHECKING:
+    from trainctl.contracts import SampledLaw
     from trainctl.controllers import relative_braking
 
     module: SampledLaw = relative_braking

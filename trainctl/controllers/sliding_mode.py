@@ -47,9 +47,10 @@ import numpy as np
 from pydantic import Field
 
 from trainctl.controllers import ahead, stated
-from trainctl.signals import SPEED, Bounds, Demand, Floats, Links, RememberingLaw, Scene, Table, Trains
+from trainctl.signals import SPEED, Bounds, Demand, Floats, Links, Scene, Table, Trains
 
 if TYPE_CHECKING:
+    from trainctl.contracts import RememberingLaw
     from trainctl.controllers import sliding_mode
 
     module: RememberingLaw = sliding_mode

@@ -49,9 +49,10 @@ import numpy as np
 from pydantic import Field
 
 from trainctl.controllers import ahead, stated
-from trainctl.signals import SPEED, Bounds, Demand, Floats, Links, RememberingLaw, Scene, Table, Trains
+from trainctl.signals import SPEED, Bounds, Demand, Floats, Links, Scene, Table, Trains
 
 if TYPE_CHECKING:
+    from trainctl.contracts import RememberingLaw
     from trainctl.controllers import time_headway
 
     module: RememberingLaw = time_headway

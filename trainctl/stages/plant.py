@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from trainctl.contracts import PointPlant, UnitPlant
 from trainctl.davis import resistance
 from trainctl.plants import coupled_units, faults, integrate, point, shared
 from trainctl.scenario.model import Model
@@ -24,11 +25,9 @@ from trainctl.signals import (
     Links,
     Messages,
     Motion,
-    PointPlant,
     References,
     Scene,
-    UnitPlant,
-)  # fmt: skip
+)
 from trainctl.topology import exchange
 
 #: A law may move a train within a step by so much [m] per second more or less than a held acceleration would.
