@@ -17,8 +17,8 @@ from trainctl.plants.disturbance import END as TABLE_END
 from trainctl.plants.disturbance import START as TABLE_START
 from trainctl.plants.disturbance import TRAIN, Signals
 from trainctl.railway.ways import Ways, ways
+from trainctl.scenario.events import Event
 from trainctl.scenario.model import Model
-from trainctl.scenario.tables import Event
 from trainctl.signals import SPEED, Bounds, Consists, Floats, Formed, Ints, Links, References, Start
 from trainctl.stages.orders import Orders
 from trainctl.stages.record import Journal
@@ -61,8 +61,6 @@ def alone(p: Model) -> str | None:
         return "supervisor.mode is not off"
     if any(not _at_once(event) and event.time_s < run.duration_s for event in p.scenario.event):
         return "it has events on the way"
-    if p.remembers:
-        return "its law keeps a state of its own"
     if p.has_units:
         return "its trains are of units"
     if p.plant.noise_hold(p.plant_params) is not None:
@@ -71,8 +69,9 @@ def alone(p: Model) -> str | None:
 
 
 def _at_once(event: Event) -> bool:
-    """Whether an order is given at the start, whatever the trains do."""
-    return event.time_s == 0.0 and event.position_m is None and event.gap_below_m is None and event.speed_below_mps is None
+    """Whether another route is ordered at the start, whatever the trains do."""
+    at_once = event.kind == "reroute" and event.time_s == 0.0
+    return at_once and event.position_m is None and event.gap_below_m is None and event.speed_below_mps is None
 
 
 def kind(p: Model) -> tuple[Any, ...]:

@@ -49,7 +49,7 @@ def points(stack: Stack) -> Done:
     instants = dict(zip(due, _instants(p, np.array(due) * run.step_s), strict=True))
     recorded = Recorded(np.array(due) * run.step_s, np.empty((len(due), len(p.own))))
     own, row, lane_position = p.own.copy(), stack.row.copy(), stack.lane_position.copy()
-    state, messages, demand = moving.initial(), exchange.silent(), control.initial()
+    state, messages, demand, memory = moving.initial(), exchange.silent(), control.initial(), ()
     nobody = np.full(len(own), np.nan)
     track, length = on_track.track(p.rails, p.line.tracks), p.consists.train_length()
     lowest = float(track.limit[stack.ways.edge].min())
@@ -67,7 +67,7 @@ def points(stack: Stack) -> Done:
             acting = disturbance.at(stack.signals, k, t, position)
             if k % run.held_steps == 0:
                 believed = moving.believed_resistance(own)
-                demand, formed, messages, _ = control.evaluated(k, t, own, believed, formed, messages, (), acting)
+                demand, formed, messages, memory = control.evaluated(k, t, own, believed, formed, messages, memory, acting)
                 demand = control.clamped(demand, own, believed)
             moved = moving.step(k, t, own, demand, nobody, formed, messages, state, acting)
             force, saturated = moved.motion.input, demand.saturated | moved.motion.limited
