@@ -409,13 +409,14 @@ class Scenario(Table):
 
     def consists(self) -> Consists:
         """Fixed data of all trains as arrays."""
-        types = [self.train_type[t.type] for t in self.train]
+        types = [t.type for t in self.train]
 
         def rows(key: str) -> Any:
-            return np.concatenate([k.per_unit(key) for k in types])
+            of = {name: self.train_type[name].per_unit(key) for name in set(types)}
+            return np.concatenate([of[name] for name in types])
 
         return Consists(
-            first=np.concatenate([[0], np.cumsum([k.units for k in types])]).astype(np.int64),
+            first=np.concatenate([[0], np.cumsum([self.train_type[name].units for name in types])]).astype(np.int64),
             length=rows("unit_length_m"),
             mass=rows("unit_mass_kg"),
             rotating=rows("rotating_mass_factor"),
