@@ -19,7 +19,7 @@ from trainctl.signals import Floats, leader_over
 MARKS = {
     "couple": ("^", "couples"), "uncouple": ("v", "uncouples"), "stop_reached": ("s", "stops"),
     "conflict": ("D", "waits for its turn"), "reroute": ("o", "new route"), "reroute_refused": ("x", "route refused"),
-    "supervisor": ("|", "supervisor acts"),
+    "supervisor": ("|", "supervisor acts"), "brake": ("<", "ordered to brake"),
 }  # fmt: skip
 #: Trains of one panel whose numbers stand on their lines, at most.
 NUMBERED = 30
