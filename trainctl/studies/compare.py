@@ -74,7 +74,7 @@ def figures(runs: Sequence[Run], labels: Sequence[str], out: Path, formats: Sequ
             figure = side_by_side(drawn, labels, paint)
             if name == "spacing_errors":
                 for axes in figure.axes:
-                    axes.set_yscale("log")
+                    style.logarithmic(axes)
                     axes.set_ylim(bottom=1e-3)
             written += style.save(figure, out / f"compare_{name}", formats)
     return written

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sumo_net.bounded import short_text
 from trainctl.errors import InputError, TrainctlError
 from trainctl.scenario.reading import examine, find, read, shipped
 from trainctl.studies.results import COUNTS, RESULTS, reasons, wilson, write_results
@@ -135,8 +136,8 @@ def ready_made(name: str) -> SweepPlan | None:
             return None
         path = known[name]
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        data = tomllib.loads(short_text(path))
+    except (OSError, ValueError, RecursionError):
         return None  # the scenario's reader says what is wrong
     if "scenario" not in data:
         return None
