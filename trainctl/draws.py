@@ -50,9 +50,14 @@ def normal(seed: int, purpose: int, count: Ints, who: Ints) -> Floats:
     return _drawn(seed, purpose, count, who, True)
 
 
+def key(seed: int) -> tuple[int, int]:
+    """The two words of a seed below 2**64 that begin every draw."""
+    return seed & WORD, seed >> 32 & WORD
+
+
 def _drawn(seed: int, purpose: int, count: Ints, who: Ints, gaussian: bool) -> Floats:
     out = np.empty((len(count), len(who)))
-    _fill(seed & WORD, seed >> 32 & WORD, purpose, np.asarray(count, np.int64), np.asarray(who, np.int64), gaussian, out)
+    _fill(*key(seed), purpose, np.asarray(count, np.int64), np.asarray(who, np.int64), gaussian, out)
     return out
 
 

@@ -38,11 +38,12 @@ import numpy as np
 from numba import njit
 from pydantic import Field
 
+from trainctl.contracts import ContinuousLaw
 from trainctl.controllers import emu_theory, stated
 from trainctl.controllers.powers import BLOCK, signed_powers
 from trainctl.davis import running_resistance
 from trainctl.kernels import inlined
-from trainctl.signals import POSITION, SPEED, ContinuousLaw, Floats, Ints, Links, Scene, Table, leader_at
+from trainctl.signals import POSITION, SPEED, Floats, Ints, Links, Scene, Table, leader_at
 
 if TYPE_CHECKING:
     from trainctl.controllers import emu_finite_time

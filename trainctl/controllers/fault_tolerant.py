@@ -46,9 +46,10 @@ import numpy as np
 from pydantic import Field
 
 from trainctl.carriages import miscounted, miscounted_trains, of_trains, spread
+from trainctl.contracts import ContinuousLaw
 from trainctl.controllers import stated
 from trainctl.kernels import inlined
-from trainctl.signals import POSITION, SPEED, ContinuousLaw, Floats, Ints, Links, Scene, Table, leader_at
+from trainctl.signals import POSITION, SPEED, Floats, Ints, Links, Scene, Table, leader_at
 
 if TYPE_CHECKING:
     from trainctl.controllers import fault_tolerant

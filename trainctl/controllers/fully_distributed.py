@@ -48,9 +48,10 @@ import numpy as np
 from numba import njit
 from pydantic import Field
 
+from trainctl.contracts import SampledLaw
 from trainctl.controllers import stated
 from trainctl.davis import resistance, resistance_of
-from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, Reference, SampledLaw, Scene, Table, Trains, leader_at
+from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, Reference, Scene, Table, Trains, leader_at
 
 if TYPE_CHECKING:
     from trainctl.controllers import fully_distributed

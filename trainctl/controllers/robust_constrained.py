@@ -39,9 +39,10 @@ import numpy as np
 from pydantic import Field
 from scipy.sparse import csgraph
 
+from trainctl.contracts import SampledLaw
 from trainctl.controllers import robust_gain, robust_theory, stated
 from trainctl.errors import InputError
-from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, SampledLaw, Scene, Table, Trains, restrict
+from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, Scene, Table, Trains, restrict
 
 if TYPE_CHECKING:
     from trainctl.controllers import robust_constrained

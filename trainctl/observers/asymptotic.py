@@ -7,6 +7,7 @@ Symbols
 -------
 =============  ===============================================================================================
 x, v, w, f     position [m], speed [m/s], acceleration [m/s2], fault states; hats are estimates, e = hat - true
+remembered     fault states of the unit when it last ran; what f goes back to while it is held
 mu1, mu2, mu3  corrections of the estimates, eq. (14)
 k1 .. k4       gains; k4 has one row per unit, one column per fault state
 C              row that turns fault states into jerk [m/s3], E / m
@@ -20,8 +21,11 @@ Departures from [1]_
 --------------------
 * (17) prints D1 without ``-r v``. Its derivative must be B1, which contains ``-r``: without it the observer is unstable.
 * At standstill the resistance is zero, as in the plant, and a unit that the plant holds there is known to stand: its estimates
-  settle on that with ``SETTLE``, its fault states go on as (3) says, uncorrected. What the law reads is the motion it would have if
-  it were let go from there. Uncorrected measurements of a unit that does not follow its forces would wind the estimates up.
+  settle on that with ``SETTLE``. What the law reads is the motion it would have if it were let go from there. Uncorrected
+  measurements of a unit that does not follow its forces would wind the estimates up.
+* The fault states of a unit that is held settle on what they were when it last ran, carried on as (3) says: ``remembered`` follows
+  them with ``LEARN`` above ``RUNS`` only. A unit let go for less time than the observer needs (n / |p|) corrects its fault
+  states in the wrong direction; kept from stop to stop, that grew without bound in a train that creeps by short pulls.
 
 References
 ----------
@@ -39,19 +43,19 @@ import numpy as np
 from pydantic import Field
 
 from trainctl.carriages import Numbers, miscounted, spread
+from trainctl.contracts import Observer
 from trainctl.davis import running_resistance
 from trainctl.kernels import inlined
-from trainctl.signals import POSITION, SPEED, Bools, Consists, Floats, Ints, Observer, Scene, Table
+from trainctl.signals import POSITION, SPEED, Bools, Consists, Floats, Ints, Scene, Table
 
 if TYPE_CHECKING:
     from trainctl.observers import asymptotic
 
     module: Observer = asymptotic
 
-WIDTH = 6  # with one sinusoid; see width()
 CORRECTIONS = 5
 
-#: Columns of ``estimate``; the fault states follow.
+#: Columns of ``estimate``; the fault states follow, then those remembered.
 X, V, W, F = 0, 1, 2, 3
 
 #: Columns of ``correction``: hat x', hat v', hat w' without the input, the part of the last one that the law leaves alone [m/s3],
@@ -64,6 +68,9 @@ Poles = Pole | tuple[Pole, ...]
 
 #: How fast estimates of a unit that is held settle on standstill [1/s].
 SETTLE = 20.0
+
+#: Speed above which a unit's fault states are remembered [m/s], and how fast [1/s]: no train gets there before they have settled.
+RUNS, LEARN = 2.0, 0.5
 
 
 class Params(Table):
@@ -107,8 +114,8 @@ class Constants(NamedTuple):
 
 
 def width(params: Params) -> int:
-    """Columns of ``estimate``: x, v, w, the constant and two per sinusoid."""
-    return 4 + 2 * len(params.fault_sinusoids)
+    """Columns of ``estimate``: x, v, w, then the constant and two per sinusoid, as estimated and as remembered."""
+    return 3 + 2 * (1 + 2 * len(params.fault_sinusoids))
 
 
 def gains(C: Sequence[float] | Floats, omega: Sequence[float] | Floats, pole: float) -> tuple[float, float, float, Floats]:
@@ -282,6 +289,8 @@ def rate(
 ) -> None:
     """d(estimate)/dt of (13); the input is what was applied after the limits."""
     c, m = constants, constants.train
+    states = c.C.shape[1]
+    R = F + states  # the first remembered
     for j in range(len(own)):
         u = m.first[i] + j
         unit = m.units[u]
@@ -292,15 +301,24 @@ def rate(
         if held[j]:
             out[j, W], ev = -SETTLE * estimate[j, W], 0.0
         out[j, F] = c.k4[u, 0] * ev
+        out[j, R] = 0.0
         for q in range(c.omega.shape[1]):
             sine, cosine = F + 1 + 2 * q, F + 2 + 2 * q
             out[j, sine] = c.omega[u, q] * estimate[j, cosine] + c.k4[u, 1 + 2 * q] * ev
             out[j, cosine] = -c.omega[u, q] * estimate[j, sine] + c.k4[u, 2 + 2 * q] * ev
+            out[j, states + sine] = c.omega[u, q] * estimate[j, states + cosine]
+            out[j, states + cosine] = -c.omega[u, q] * estimate[j, states + sine]
+        if held[j]:
+            for q in range(F, R):
+                out[j, q] += SETTLE * (estimate[j, states + q] - estimate[j, q])
+        elif own[j, SPEED] > RUNS:
+            for q in range(F, R):
+                out[j, states + q] += LEARN * (estimate[j, q] - estimate[j, states + q])
 
 
 def fault_estimate(constants: Constants, estimate: Floats) -> Floats:
     """C f_hat of every unit [m/s3], for logs."""
-    total: Floats = (constants.C * estimate[:, F:]).sum(axis=1)
+    total: Floats = (constants.C * estimate[:, F : F + constants.C.shape[1]]).sum(axis=1)
     return total
 
 

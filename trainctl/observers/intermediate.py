@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from trainctl.contracts import Observer
 from trainctl.kernels import inlined
 from trainctl.observers.asymptotic import (
     FRONT,
@@ -45,7 +46,7 @@ from trainctl.observers.asymptotic import (
     static_force,
     train_of,
 )
-from trainctl.signals import POSITION, SPEED, Bools, Floats, Observer, Scene, Table
+from trainctl.signals import POSITION, SPEED, Bools, Floats, Scene, Table
 
 if TYPE_CHECKING:
     from trainctl.observers import intermediate

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from trainctl.contracts import Observer
 from trainctl.kernels import inlined
-from trainctl.signals import Bools, Floats, Observer, Scene, Table
+from trainctl.signals import Bools, Floats, Scene, Table
 
 if TYPE_CHECKING:
     from trainctl.observers import none

@@ -31,6 +31,7 @@ import numpy as np
 from pydantic import Field
 
 from trainctl import draws
+from trainctl.contracts import UnitPlant
 from trainctl.davis import running_resistance
 from trainctl.kernels import inlined
 from trainctl.plants import coupled_units
@@ -58,7 +59,7 @@ from trainctl.plants.coupled_units import room as room
 from trainctl.plants.coupled_units import sure_braking as sure_braking
 from trainctl.plants.faults import Fault, Faults, effectiveness, fault_rate, tabulated
 from trainctl.plants.faults import violations as fault_violations
-from trainctl.signals import FORCE, GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Reliance, Scene, UnitPlant
+from trainctl.signals import FORCE, GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Reliance, Scene
 
 if TYPE_CHECKING:
     from trainctl.plants import actuated_units
@@ -228,7 +229,7 @@ def limit(i: int, constants: Constants, own: Floats, applied: Floats) -> bool:
 
 @inlined()
 def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, applied: Floats, out: Floats, power: Floats) -> None:
-    """d(own)/dt, eqs. (1), (2), and the train's powers [W]: see ``signals.Plant``.
+    """d(own)/dt, eqs. (1), (2), and the train's powers [W]: see ``contracts.Plant``.
 
     Faults and noise act on the force, so they are part of traction and braking power.
 
@@ -305,7 +306,7 @@ def relied_on(
     params: Params, consists: Consists, faults: Sequence[Fault], trains: Sequence[str], braking: float, top: Floats, fall: Floats,
     deviations: float,
 ) -> Reliance:  # fmt: skip
-    """As ``signals.Plant`` says: what coupled units give comes late, and noise comes on top."""
+    """As ``contracts.Plant`` says: what coupled units give comes late, and noise comes on top."""
     found = coupled_units.relied_on(params, consists, faults, trains, braking, top, fall, deviations)
     davis, lag = consists.train_davis(), np.maximum.reduceat(1.0 / consists.actuator_rate, consists.first[:-1])
     # Resistance falls as the train slows down, and the actuators follow late.

@@ -25,11 +25,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from trainctl.contracts import UnitPlant
 from trainctl.davis import resistance, running_resistance
 from trainctl.kernels import inlined
 from trainctl.plants import faults as actuators
 from trainctl.plants.faults import Fault
-from trainctl.signals import GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Reliance, Scene, Table, UnitPlant
+from trainctl.signals import GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Reliance, Scene, Table
 
 if TYPE_CHECKING:
     from trainctl.plants import coupled_units
@@ -298,7 +299,7 @@ def relied_on(
     params: Params, consists: Consists, faults: Sequence[Fault], trains: Sequence[str], braking: float, top: Floats, fall: Floats,
     deviations: float,
 ) -> Reliance:  # fmt: skip
-    """As ``signals.Plant`` says: units act at once, each as far as its own brakes and faults let it."""
+    """As ``contracts.Plant`` says: units act at once, each as far as its own brakes and faults let it."""
     share, bias = actuators.shares(faults, trains, consists)
     units, leading = np.diff(consists.first), consists.first[:-1]
     inertia = consists.mass * consists.rotating

@@ -17,11 +17,12 @@ import numpy as np
 from numba import njit
 from pydantic import Field, ValidationInfo, field_validator
 
+from trainctl.contracts import PointPlant
 from trainctl.davis import resistance as resistance
 from trainctl.davis import resistance_of
 from trainctl.plants import faults as actuators
 from trainctl.plants.faults import Fault
-from trainctl.signals import GRAVITY, POSITION, SPEED, Bools, Bounds, Consists, Floats, PointPlant, Reliance, Scene, Table
+from trainctl.signals import GRAVITY, POSITION, SPEED, Bools, Bounds, Consists, Floats, Reliance, Scene, Table
 
 if TYPE_CHECKING:
     from trainctl.plants import point
@@ -184,7 +185,7 @@ def relied_on(
     params: Params, consists: Consists, faults: Sequence[Fault], trains: Sequence[str], braking: float, top: Floats, fall: Floats,
     deviations: float,
 ) -> Reliance:  # fmt: skip
-    """As ``signals.Plant`` says: points act at once."""
+    """As ``contracts.Plant`` says: points act at once."""
     upper, zero = params.input_upper_mps2, np.zeros(len(top))
     pull = np.full(len(top), np.inf if upper is None else upper)
     return Reliance(np.minimum(braking, sure_braking(params, consists, top) - fall), pull, zero, zero, zero, zero)

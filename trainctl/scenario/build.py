@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 import sumo_net
 from sumo_net import Line, LineError
+from trainctl.contracts import Plant
 from trainctl.errors import InputError
 from trainctl.laws import find_law, find_observer, find_plant
 from trainctl.scenario import limits, placing, promise, roster
@@ -23,10 +24,7 @@ from trainctl.scenario.plan import initial, plan_of
 from trainctl.scenario.reading import examine, mistakes, read
 from trainctl.scenario.reference import Profile
 from trainctl.scenario.tables import Scenario
-from trainctl.signals import (
-    POSITION,
-    Plant,
-)  # fmt: skip
+from trainctl.signals import POSITION
 from trainctl.topology import graph
 
 

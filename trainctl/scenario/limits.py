@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from trainctl.contracts import Plant
 from trainctl.scenario.tables import Scenario
-from trainctl.signals import Bounds, Consists, Floats, Plant
+from trainctl.signals import Bounds, Consists, Floats
 
 #: The keys of ``Bounds``, in [bounds], [plant] and [[train]].
 KEYS = ("speed_lower_mps", "speed_upper_mps", "input_lower_mps2", "input_upper_mps2")

@@ -14,7 +14,8 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 from sumo_net import Rails
-from trainctl.scenario.tables import Order, TrafficTable
+from trainctl.scenario.events import Order
+from trainctl.scenario.tables import TrafficTable
 from trainctl.signals import Bools, Ints
 from trainctl.traffic.rail_signals import Signal
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from sumo_net import Rails
 from trainctl import draws
+from trainctl.contracts import Observer, Plant
 from trainctl.davis import resistance
 from trainctl.plants import disturbance
 from trainctl.railway import signs, supervisor
@@ -19,21 +20,7 @@ from trainctl.railway.authority import DRIVER_MARGIN_M
 from trainctl.railway.signs import Signs
 from trainctl.scenario import limits, promise
 from trainctl.scenario.tables import Scenario, TrafficTable
-from trainctl.signals import (
-    POSITION,
-    SPEED,
-    Bounds,
-    Consists,
-    Floats,
-    Ints,
-    Links,
-    Observer,
-    Plant,
-    Reference,
-    Scene,
-    leader_at,
-    restrict,
-)  # fmt: skip
+from trainctl.signals import POSITION, SPEED, Bounds, Consists, Floats, Ints, Links, Reference, Scene, leader_at, restrict
 from trainctl.topology import convoys, graph
 from trainctl.topology.exchange import Radio
 
@@ -75,7 +62,12 @@ class Model:
     @property
     def rerouted(self) -> bool:
         """Whether trains may be given other routes than they begin with."""
-        return bool(self.scenario.event or self.roster.closings)
+        return any(event.kind == "reroute" for event in self.scenario.event) or bool(self.roster.closings)
+
+    @property
+    def braked(self) -> bool:
+        """Whether trains may be ordered to brake."""
+        return any(event.kind == "brake" for event in self.scenario.event)
 
     @property
     def placed(self) -> bool:
@@ -209,7 +201,8 @@ class Model:
         run, top = self.scenario.run, self.scenario.topology
         period = top.communication_period_s or run.control_period_s or run.step_s
         names = np.array([draws.word(name) for name in self.scenario.ids], np.int64)
-        return Radio(top.loss, round(top.delay_s / period), top.range_m or np.inf, run.seed or 0, names)
+        key = np.tile(np.array(draws.key(run.seed or 0), np.int64), (len(names), 1))
+        return Radio(top.loss, round(top.delay_s / period), top.range_m or np.inf, key, names)
 
     @property
     def spacing(self) -> convoys.Spacing:

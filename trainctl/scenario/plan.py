@@ -7,16 +7,11 @@ from itertools import pairwise
 
 import numpy as np
 
+from trainctl.contracts import Plant
 from trainctl.errors import InputError
 from trainctl.scenario import placing
 from trainctl.scenario.tables import Scenario
-from trainctl.signals import (
-    POSITION,
-    SPEED,
-    Consists,
-    Floats,
-    Plant,
-)  # fmt: skip
+from trainctl.signals import POSITION, SPEED, Consists, Floats
 from trainctl.topology import graph
 
 

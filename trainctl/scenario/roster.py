@@ -177,6 +177,11 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         if not any(fnmatch.fnmatchcase(i, p) for i in ids)
     ]
     found += _events(scenario, ids, rails)
+    found += [
+        f"event[{k}]: train {event.train} is SUMO's own and takes no orders: traffic.others = sumo"
+        for k, event in enumerate(scenario.event, 1)
+        if event.train in ids and driven[ids.index(event.train)]
+    ]
     trains, routes, stops, arrival = [], [], [], []
     factor = np.array([min(traffic.kinds[d.kind].speed_factor, 1.0) for d in traffic.departures])
     for d, share in zip(traffic.departures, factor.tolist(), strict=True):

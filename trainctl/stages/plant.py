@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from trainctl.contracts import PointPlant, UnitPlant
 from trainctl.davis import resistance
 from trainctl.plants import coupled_units, faults, integrate, point, shared
 from trainctl.scenario.model import Model
@@ -24,11 +25,9 @@ from trainctl.signals import (
     Links,
     Messages,
     Motion,
-    PointPlant,
     References,
     Scene,
-    UnitPlant,
-)  # fmt: skip
+)
 from trainctl.topology import exchange
 
 #: A law may move a train within a step by so much [m] per second more or less than a held acceleration would.
@@ -153,7 +152,7 @@ class Units:
         self.masses = p.consists.train_mass()
         self.lag = p.assumed.lag
         self.hilly = bool(len(self.gradient)) or bool(p.net_slope.any())
-        ordered = p.looks_ahead
+        ordered = p.looks_ahead or p.braked
         # Written anew in every step before they are read, like the columns of the plant's table that disturb it.
         self.told = shared.constants(p.plant_params, p.consists, self.gradient) if p.sampled else shared.NOBODY
         self.orders = integrate.Orders(

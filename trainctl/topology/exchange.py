@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from trainctl import draws
 from trainctl.signals import Bools, Floats, Ints, Links, Messages
@@ -17,7 +18,7 @@ class Radio(NamedTuple):
     loss: float
     delay: int  # exchange periods
     radius: float
-    seed: int
+    key: Ints  # (n, 2) words of the seed of each train's run: see ``draws.key``
     names: Ints  # (n,) a word for each train: see ``draws.word``
 
 
@@ -72,7 +73,15 @@ def deliver(radio: Radio, messages: Messages, sent: Floats, position: Floats, li
     if np.isfinite(radio.radius):
         arrives &= reach(position, links, radio.radius)
     if radio.loss > 0.0:
-        pairs = np.column_stack([radio.names[links.sender], radio.names[links.receiver]])
-        arrives &= draws.uniform(radio.seed, draws.LOSS, np.array([count]), pairs)[0] >= radio.loss
+        _lose(radio.loss, radio.key, radio.names, links.sender, links.receiver, count, arrives)
     np.copyto(heard, under_way[0][links.sender], where=arrives[:, None])
     return Messages(under_way, heard, ever | arrives), arrives
+
+
+@njit(cache=True)
+def _lose(loss: float, key: Ints, names: Ints, sender: Ints, receiver: Ints, count: int, arrives: Bools) -> None:
+    """Strike out of ``arrives`` (L,) what is lost in exchange ``count``."""
+    for k in range(len(arrives)):
+        s, r = sender[k], receiver[k]
+        drawn, _ = draws.uniforms(count, draws.LOSS, names[s], names[r], key[r, 0], key[r, 1])
+        arrives[k] = arrives[k] and drawn >= loss

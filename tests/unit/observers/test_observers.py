@@ -140,7 +140,7 @@ def test_error_obeys_the_matrix_exponential():
         zeta = correction[:, V_RATE] - rate[:, SPEED] - constants.k2 * ev  # e_w + mu2 - k2 e_v
         f = np.zeros((3, 3))
         f[1] = 1.0, 0.5 * math.sin(t + 0.4), 0.5 * math.cos(t + 0.4)
-        return np.column_stack([ev, zeta, estimate[:, 3:] - f]), estimate[:, 0] - own[:, POSITION]
+        return np.column_stack([ev, zeta, estimate[:, 3:6] - f]), estimate[:, 0] - own[:, POSITION]
 
     xi0, ex0 = errors(0.0, own, estimate)
     for k in range(500):
@@ -174,10 +174,30 @@ def test_without_compensation_only_the_control_forgets_the_fault():
     np.testing.assert_array_equal(found[0][0][:, UNCOMPENSATED], 0.0)
 
 
+def test_a_train_that_creeps_by_short_pulls_keeps_its_estimates():
+    """Let go for 0.7 s and held for 1.3 s, over and over: the observer has no time to learn, and must not unlearn."""
+    s = scene()
+    own = s.own.copy()
+    own[:, SPEED] = 0.0
+    constants = asymptotic.constants(asymptotic.Params(), s)
+    estimate, h = asymptotic.initial(asymptotic.Params(), own), 0.01
+    estimate[:, 3:6] = estimate[:, 6:] = 0.1
+    largest = 0.0
+    for k in range(200 * 60):
+        held = np.full(3, k % 200 >= 70)
+        correction, rate = np.zeros((3, asymptotic.CORRECTIONS)), np.zeros_like(estimate)
+        asymptotic.correction(0, constants, own, estimate, held, correction)
+        asymptotic.rate(0, constants, own, estimate, held, correction, correction[:, STATIC], rate)
+        estimate += h * rate
+        largest = max(largest, float(np.abs(estimate[:, 3:]).max()))
+    assert largest < 2.0
+    np.testing.assert_allclose(np.abs(estimate[:, 6]), 0.1)  # nothing new is remembered of a train that never ran
+
+
 def test_width_follows_the_fault_model():
     for sinusoids in ((), ((1.0, 2e5),), ((1.0, 2e5), (2.0, 1e5))):
         params = asymptotic.Params(fault_sinusoids=sinusoids)
-        assert asymptotic.initial(params, scene().own).shape == (3, asymptotic.width(params)) == (3, 4 + 2 * len(sinusoids))
+        assert asymptotic.initial(params, scene().own).shape == (3, asymptotic.width(params)) == (3, 5 + 4 * len(sinusoids))
         constants = asymptotic.constants(params, scene())
         assert np.isfinite(
             observed(asymptotic, constants, scene().own, asymptotic.initial(params, scene().own), np.zeros(3))[1]

@@ -94,6 +94,10 @@ def test_senders_ahead_come_first_in_order():
 NAMES = np.array([draws.word(str(i)) for i in range(1, 7)])
 
 
+def seeded(loss, delay, radius, seed, names):
+    return Radio(loss, delay, radius, np.tile(draws.key(seed), (len(names), 1)), names)
+
+
 def deliveries(radio, links, count):
     """Which links heard in so many exchanges, and the messages after them; train i says k in exchange k."""
     messages, heard, position = silent(), [], np.arange(6.0) * -1000.0
@@ -105,7 +109,7 @@ def deliveries(radio, links, count):
 
 def test_losses_are_seeded_and_of_the_stated_share():
     links = made(plan(), [1] * 6)
-    first, again, other = (deliveries(Radio(0.1, 0, np.inf, seed, NAMES), links, 2000)[0] for seed in (1, 1, 2))
+    first, again, other = (deliveries(seeded(0.1, 0, np.inf, seed, NAMES), links, 2000)[0] for seed in (1, 1, 2))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
     assert 1 - first.mean() == pytest.approx(0.1, abs=0.01)
@@ -115,7 +119,7 @@ def test_losses_belong_to_sender_and_receiver():
     """Trains that come between, or stand in another order, change nobody else's losses; links lose independently."""
     few, many = made(plan(), [1] * 6), made(plan(), [1] * 6)
     turned = NAMES[::-1].copy()
-    one, other = (deliveries(Radio(0.3, 0, np.inf, 5, names), links, 2000)[0] for names, links in ((NAMES, few), (turned, many)))
+    one, other = (deliveries(seeded(0.3, 0, np.inf, 5, names), links, 2000)[0] for names, links in ((NAMES, few), (turned, many)))
     pair = {(NAMES[s], NAMES[r]): one[:, k] for k, (s, r) in enumerate(zip(few.sender, few.receiver, strict=True))}
     for k, (s, r) in enumerate(zip(many.sender, many.receiver, strict=True)):
         assert np.array_equal(other[:, k], pair[turned[s], turned[r]])
@@ -123,7 +127,7 @@ def test_losses_belong_to_sender_and_receiver():
 
 
 def test_a_lost_message_leaves_the_last_one_in_place():
-    links, radio = made(plan(), [1] * 6), Radio(0.5, 0, np.inf, 3, NAMES)
+    links, radio = made(plan(), [1] * 6), seeded(0.5, 0, np.inf, 3, NAMES)
     messages = silent()
     for k in range(50):
         before = messages
@@ -135,7 +139,7 @@ def test_a_lost_message_leaves_the_last_one_in_place():
 
 def test_an_exchange_leaves_the_messages_before_as_they_were():
     """Whoever tries a step must find them again."""
-    links, radio = made(plan(), [1] * 6), Radio(0.5, 1, np.inf, 3, NAMES)
+    links, radio = made(plan(), [1] * 6), seeded(0.5, 1, np.inf, 3, NAMES)
     messages = deliveries(radio, links, 5)[1]
     sent, heard, ever = [s.copy() for s in messages.sent], messages.heard.copy(), messages.ever.copy()
     later, _ = deliver(radio, messages, np.full((6, 1), 9.0), np.zeros(6), links, 5)
@@ -146,24 +150,24 @@ def test_an_exchange_leaves_the_messages_before_as_they_were():
 
 def test_delay_counts_exchanges():
     links = made(plan(), [1] * 6)
-    heard, messages = deliveries(Radio(0.0, 2, np.inf, 0, NAMES), links, 3)
+    heard, messages = deliveries(seeded(0.0, 2, np.inf, 0, NAMES), links, 3)
     assert heard.all(axis=1).tolist() == [False, False, True]
     assert np.all(messages.heard == 0.0)
-    heard, messages = deliveries(Radio(0.0, 2, np.inf, 0, NAMES), links, 8)
+    heard, messages = deliveries(seeded(0.0, 2, np.inf, 0, NAMES), links, 8)
     assert np.all(messages.heard == 5.0) and len(messages.sent) == 3  # what has arrived is not kept
 
 
 def test_messages_end_at_the_range():
     links = made(plan(), [1] * 6)
     position = np.array([0.0, -1000.0, -3000.0, -4000.0, -5000.0, -6000.0])
-    _, heard = deliver(Radio(0.0, 0, 1500.0, 0, NAMES), silent(), np.zeros((6, 1)), position, links, 0)
+    _, heard = deliver(seeded(0.0, 0, 1500.0, 0, NAMES), silent(), np.zeros((6, 1)), position, links, 0)
     pairs = {frozenset((int(s), int(r))) for s, r, h in zip(links.sender, links.receiver, heard, strict=True) if not h}
     assert pairs == {frozenset((1, 2))}
 
 
 def test_what_was_heard_stays_with_its_link_when_the_graph_changes():
     before, after = made(plan(), [1, 1, 1, 1, 2, 1]), made(plan(), [1, 3, 1, 1, 1, 1])
-    messages, _ = deliver(Radio(0.0, 0, np.inf, 0, NAMES), silent(), np.arange(6.0)[:, None], np.zeros(6), before, 0)
+    messages, _ = deliver(seeded(0.0, 0, np.inf, 0, NAMES), silent(), np.arange(6.0)[:, None], np.zeros(6), before, 0)
     messages = relinked(messages, before, after)
     heard = {
         (int(s), int(r)): (v, e)
@@ -176,7 +180,7 @@ def test_what_was_heard_stays_with_its_link_when_the_graph_changes():
 def test_a_link_that_has_received_once_stays_one_whatever_is_lost_and_however_the_graph_changes():
     """A train that goes by old messages must not take the zeros of a new link for one."""
     before, after = made(plan(), [1, 1, 1, 1, 2, 1]), made(plan(), [1, 3, 1, 1, 1, 1])
-    messages, radio = silent(), Radio(0.5, 0, np.inf, 1, NAMES)
+    messages, radio = silent(), seeded(0.5, 0, np.inf, 1, NAMES)
     received, last = np.zeros(len(before.sender), bool), np.zeros(len(before.sender))
     for k in range(1, 3):
         messages, heard = deliver(radio, messages, 10.0 * k + np.arange(6.0)[:, None], np.zeros(6), before, k)
