@@ -73,7 +73,7 @@ class Loop(Steps):
         self.orders, self.traffic = orders.Orders(p, journal), traffic.Traffic(p, journal)
         self.signals = signals.Signals(p, journal)
         self.topology = topology.Topology(p, journal)
-        self.control, self.driver, self.plant = control.Control(p), driver.of(p), plant.of(p)
+        self.control, self.driver, self.plant = control.Control(p, p.radio), driver.of(p), plant.of(p, p.radio)
         self.protect = protect.Protect(p, journal, bool(len(self.disturbances.whole)) or self.plant.noisy)
         rule, formed = self.topology.rule.initial()
         self.state = State(

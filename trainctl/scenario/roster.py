@@ -78,8 +78,11 @@ class Roster(NamedTuple):
     placed: bool  # by [[train]] tables, all there from the start; else they come and go
 
 
-def placed(scenario: Scenario, line: Line) -> Roster:
-    """Trains that stand on a line from the start and run to its end; free of the mistakes ``placing.on_the_line`` finds."""
+def placed(scenario: Scenario, line: Line, rails: Rails | None = None) -> Roster:
+    """Trains that stand on a line from the start and run to its end; free of the mistakes ``placing.on_the_line`` finds.
+
+    ``rails`` are those of the line, where they are known.
+    """
     n = len(scenario.train)
     places = [line.locate(t.track, t.position_m) for t in scenario.train]
     return Roster(
@@ -88,7 +91,7 @@ def placed(scenario: Scenario, line: Line) -> Roster:
         top_speed=np.full(n, np.inf), speed_factor=np.ones(n),
         routes=tuple(line.route(t.track, t.position_m) for t in scenario.train), stops=((),) * n, cooperates=np.ones(n, bool),
         vclass=("rail",) * n, patience=np.inf, notes=(), signs=(), closings=(), source="", driven=np.zeros(n, bool), signals=(),
-        handed=None, rails=Rails.of(line), placed=True,
+        handed=None, placed=True, rails=Rails.of(line) if rails is None else rails,
     )  # fmt: skip
 
 

@@ -368,6 +368,9 @@ BOMB = '<!DOCTYPE x [<!ENTITY a "lol"><!ENTITY b "&a;&a;&a;">]><fcd-export><time
         (b'<fcd-export><timestep time="0"><vehicle id="a"/></timestep></fcd-export>', "without id or speed"),
         (b'<?xml version="1.0" encoding="nonsense"?><fcd-export/>', "nonsense|unknown encoding"),
         (CSV.replace("120", "much").encode(), "pos = much: not a number"),
+        (CSV.replace("2.00;a", "2.00;a;10;110;e_0\n2.00;a").encode(), "vehicle a stands twice at 2 s"),
+        (FCD.replace('id="c"', 'id="b"').encode(), "vehicle b stands twice at 2 s"),
+        (CSV.partition("\n")[2].encode(), "line 1 = 0.00;a;10;100;e_0: a CSV log begins with the names of its columns"),
         (b"timestep_time;vehicle_id;vehicle_speed\n0;a\xff;1\n", "not a CSV log"),
     ],
 )
