@@ -253,9 +253,11 @@ class TrainType(Table):
             raise ValueError("; ".join(wrong))
         return self
 
-    def per_unit(self, key: str, missing: float = math.inf) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """The key's value for every unit, shape (units,); couplers are padded with 0 behind the last unit."""
+    def per_unit(self, key: str, missing: float = math.inf) -> np.ndarray[Any, np.dtype[Any]]:
+        """The key's value for every unit, shape (units,); couplers padded with 0 behind the last, installed force True."""
         value = getattr(self, key)
+        if key == "force_share":
+            return np.full(self.units, value == "installed")
         if key in self._couplers:
             row = np.zeros(self.units)
             row[: self.units - 1] = value if not isinstance(value, tuple) else value[: self.units - 1]
@@ -437,7 +439,7 @@ class Scenario(Table):
             braking=rows("braking_n"),
             braking_power=rows("braking_power_w"),
             actuator_rate=rows("actuator_rate_per_s"),
-            installed=np.concatenate([np.full(k.units, k.force_share == "installed") for k in types]),
+            installed=rows("force_share"),
         )
 
     def bounds_of_trains(self) -> Bounds:

@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from sumo_net.bounded import short_text
 from trainctl.errors import InputError
 from trainctl.scenario.reading import examine, find, read, shipped
 from trainctl.studies.blocks import blocks, refusal, simulate_block
@@ -133,8 +134,8 @@ def ready_made(name: str) -> SweepPlan | None:
             return None
         path = known[name]
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        data = tomllib.loads(short_text(path))
+    except (OSError, ValueError, RecursionError):
         return None  # the scenario's reader says what is wrong
     if "scenario" not in data:
         return None

@@ -199,7 +199,9 @@ def test_gap_is_negative_where_trains_overlap(ahead: float, told: list[float], e
     """In a row, and between two rows, where only the event knows."""
     tables = three_trains()
     tables["trains"]["gap_m"] = tables["trains"]["gap_m"] - ahead
-    events = [{"kind": "violation", "time_s": 1.5, "bound": "gap_m", "trains": ["1", "2"], "value": value} for value in told]
+    events = [
+        {"kind": "violation", "time_s": 1.5, "bound": "gap_m", "who": "1-2", "trains": ["1", "2"], "value": value} for value in told
+    ]
     assert metrics(run_folder(tmp_path, tables, scenario(), events))["traffic.gap_min_m"] == expected
 
 
