@@ -75,8 +75,13 @@ def compare(
         int | None, typer.Option(help="The first so many of them are searched with; default 20.", rich_help_panel=SPACING)
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of what is random in them; default 1.", rich_help_panel=SPACING)] = None,
-    loss: Annotated[float | None, typer.Option(help="Share of messages lost; default 0.1.", rich_help_panel=SPACING)] = None,
+    loss: Annotated[
+        float | None, typer.Option(help="Share of messages lost in good times; default 0.02.", rich_help_panel=SPACING)
+    ] = None,
     delay_s: Annotated[float | None, typer.Option(help="Age of messages in s; default 1.", rich_help_panel=SPACING)] = None,
+    bad_s: Annotated[
+        float | None, typer.Option(help="Mean length of times when none arrives in s; default 3, 0: none.", rich_help_panel=SPACING)
+    ] = None,
     brake_scatter: Annotated[
         float | None, typer.Option(help="Share by which brakes scatter, either way; default 0.05.", rich_help_panel=SPACING)
     ] = None,
@@ -106,7 +111,8 @@ def compare(
         "signals_m": signals_m, "spacing_m": spacing_m,
     }  # fmt: skip
     of_spacing = {
-        "stops": stops, "searched": searched, "seed": seed, "loss": loss, "delay_s": delay_s, "brake_scatter": brake_scatter,
+        "stops": stops, "searched": searched, "seed": seed, "loss": loss, "delay_s": delay_s, "bad_s": bad_s,
+        "brake_scatter": brake_scatter,
     }  # fmt: skip
     if names == ["spacing"] and controllers is None:
         from trainctl.cli.spacing import spacing
