@@ -20,7 +20,9 @@ class Channel(Table):
         None, description="Mean length of good times [s]: with bad_s the channel has two states (Gilbert-Elliott); default one."
     )
     bad_s: Positive | None = Field(None, description="Mean length of bad times [s].")
-    bad_loss: Share = Field(1.0, description="Probability that a message is lost in bad times; in good ones it is topology.loss.")
+    bad_loss: Share | None = Field(
+        None, description="Probability that a message is lost in bad times, default 1; in good ones it is topology.loss."
+    )
     delay_spread_s: NotNegative = Field(
         0.0,
         description="Random delay on top of topology.delay_s: width if uniform, mean if exponential (up to five means) [s].",
@@ -39,7 +41,7 @@ class Channel(Table):
     def _together(self) -> Channel:
         if (self.good_s is None) != (self.bad_s is None):
             raise ValueError("good_s and bad_s: give both or none")
-        if self.bad_s is None and "bad_loss" in self.model_fields_set:
+        if self.bad_s is None and self.bad_loss is not None:
             raise ValueError(f"bad_loss = {self.bad_loss:g}: only with good_s and bad_s")
         if self.send_every_s is not None and self.send_beyond_m is None:
             raise ValueError(f"send_every_s = {self.send_every_s:g}: only with send_beyond_m")

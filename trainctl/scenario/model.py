@@ -200,7 +200,7 @@ class Model:
         c, of = self.scenario.channel, {name: i for i, name in enumerate(self.scenario.ids)}
         outages = [(of.get(e.train, -1), e.time_s, e.until_s) for e in self.scenario.event if e.kind == "outage"]
         return Radio(
-            top.loss, round(top.delay_s / period), top.range_m or np.inf, key, names, c.bad_loss,
+            top.loss, round(top.delay_s / period), top.range_m or np.inf, key, names, 1.0 if c.bad_loss is None else c.bad_loss,
             period / c.good_s if c.good_s else 0.0, period / c.bad_s if c.bad_s else 1.0, c.delay_spread_s / period,
             c.delay_shape == "exponential", -1.0 if c.send_beyond_m is None else c.send_beyond_m,
             exchanges(c.send_every_s or 0.0, period), np.array(outages, np.float64).reshape(-1, 3),

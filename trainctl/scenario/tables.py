@@ -338,6 +338,9 @@ class Scenario(Table):
     order: tuple[Order, ...] = ()
     disturbance: tuple[Disturbance, ...] = ()
     fault: tuple[Fault, ...] = ()
+    alternative: dict[str, dict[str, Any]] = Field(
+        {}, description="Keys of [controller] for rows of `trainctl compare NAME --controllers all`, by the name of the row."
+    )
 
     @field_validator("train")
     @classmethod

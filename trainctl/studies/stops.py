@@ -4,9 +4,9 @@ How close trains may follow each other under a law: the smallest desired spacing
 
 The question is the same for all laws. Trains on a level line run at one speed, at their desired spacing but for small errors.
 Then the first one brakes as hard as it can, by an order of its own, to a stand; the reference of the others does not change, so
-they learn of it by messages alone. Messages come a period late, and some not at all, mostly in bursts. Brakes and running resistance are unlike
-from train to train, and no law is told by how much; a force nobody knows of acts on each, and measured positions are off (for
-continuous laws they are exact: such a law has no instants to measure at). Nothing protects the trains.
+they learn of it by messages alone. Messages come a period late, and some not at all, mostly in bursts. Brakes and running
+resistance are unlike from train to train, and no law is told by how much; a force nobody knows of acts on each, and measured
+positions are off (for continuous laws they are exact: such a law has no instants to measure at). Nothing protects the trains.
 
 A stop fails if two trains touch, or one is faster than the line. The **smallest safe spacing** is found by bisection with the
 first ``searched`` stops; that spacing and some per cent less and more are then run with all of them, for safety need not be
