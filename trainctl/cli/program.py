@@ -28,7 +28,7 @@ from trainctl.cli.console import (
     show,
     show_json,
 )
-from trainctl.errors import InputError, TrainctlError
+from trainctl.errors import InputError, TrainctlError, left_out
 
 if TYPE_CHECKING:
     from trainctl.runs.run import Run
@@ -276,9 +276,9 @@ def schema(
 
 def _version(wanted: bool) -> None:
     if wanted:
-        from importlib.metadata import version
+        from trainctl.record.folder import installed
 
-        say(f"trainctl {version('trainctl')}, SUMO {version('libsumo')}")
+        say(f"trainctl {installed('trainctl')}, SUMO {installed('libsumo') or 'not installed'}")
         raise typer.Exit
 
 
@@ -323,6 +323,11 @@ def main() -> None:
     except TrainctlError as error:
         _tell([f"trainctl: {error}"])
         sys.exit(error.exit_code)
+    except ImportError as error:
+        if not (words := left_out(error.name or "")):
+            raise
+        _tell([f"trainctl: {words}"])
+        sys.exit(2)
     except (KeyboardInterrupt, typer.Abort):
         _tell(["trainctl: interrupted"])
         sys.exit(130)
