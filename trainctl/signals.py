@@ -58,6 +58,11 @@ class Consists(NamedTuple):
     braking: Floats  # N, positive
     braking_power: Floats  # W
     actuator_rate: Floats  # 1/s, r of the actuator tau' = -r tau + r demand
+    installed: Bools = np.zeros(0, np.bool_)  # the force of this unit's train is shared out by installed force; empty: nobody's
+
+    def by_installed_force(self) -> Bools:
+        """Whether the force of every train is shared out by what its units have installed, shape (n,); else it goes by mass."""
+        return self.installed[self.first[:-1]] if len(self.installed) else np.zeros(len(self.first) - 1, np.bool_)
 
     def train_length(self) -> Floats:
         """Length of every train [m], shape (n,)."""
@@ -230,9 +235,10 @@ def restrict(scene: Scene, members: Ints) -> Scene:
     links, rows = scene.links, new[scene.links.receiver] >= 0
     kept = {name: getattr(links, name)[rows] for name in ("desired", "lower", "upper", "weight", "heard")}
     receiver = new[links.receiver[rows]]
+    of_units: list[Any] = [row[units] if len(row) else row for row in scene.consists[1:]]
     return scene._replace(
         trains=[scene.trains[i] for i in members.tolist()],
-        consists=type(scene.consists)(first, *(row[units] for row in scene.consists[1:])),
+        consists=type(scene.consists)(first, *of_units),
         own=scene.own[units],
         links=links._replace(
             sender=new[links.sender[rows]], receiver=receiver, first=np.searchsorted(receiver, np.arange(len(members) + 1)),

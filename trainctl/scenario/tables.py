@@ -6,33 +6,25 @@ import hashlib
 import math
 from collections import Counter
 from functools import cached_property
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, ConfigDict, Field, field_validator, model_validator
+from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from trainctl.laws import moves_points
 from trainctl.plants.disturbance import Disturbance
 from trainctl.plants.faults import Fault
 from trainctl.railway.supervisor import Params as Supervisor
+from trainctl.scenario.events import Event, Order
+from trainctl.scenario.keys import Id, NotNegative, PerUnit, Positive
 from trainctl.scenario.reference import Profile
 from trainctl.signals import Bounds, Consists, Floats, Table
 
 SCHEMA_VERSION = 1
 
 
-def _name(value: Any) -> Any:
-    """Ids are text; a number may stand for one."""
-    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
-
-
 #: More are none: beyond, a number of steps is not exact.
 MOST_STEPS = 1e15
-
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
-Id = Annotated[str, BeforeValidator(_name, json_schema_input_type=int | str)]
-PerUnit = float | tuple[float, ...]
 
 
 class RunTable(Table):
@@ -110,6 +102,15 @@ class TrafficTable(Table):
 
     cooperate: tuple[str, ...] = Field(
         ("*",), description="Trains that join formations, by id; * stands for anything. The others are driven by themselves."
+    )
+    others: Literal["driven", "sumo"] = Field(
+        "driven",
+        description="Trains that do not cooperate: driven: by our driver, on our plants; sumo: by SUMO, with their own vTypes.",
+    )
+    signals: Literal["ignore", "obey"] | None = Field(
+        None,
+        description="Rail signals of the net: obey: they decide who goes first; ignore: our own interlocking does. Default: obey"
+        " where there are some and not every train cooperates, or SUMO drives some of them.",
     )
     acceleration_mps2: Positive = Field(0.4, description="Acceleration of a train or formation that is driven [m/s2].")
     deceleration_mps2: Positive = Field(0.5, description="Braking for limits, stops and trains ahead, positive [m/s2].")
@@ -206,16 +207,24 @@ class TrainType(Table):
     braking_n: PerUnit | None = Field(None, description="Maximum braking effort, positive [N]; default unlimited.")
     braking_power_w: PerUnit | None = Field(None, description="Maximum braking power [W]; default unlimited.")
     actuator_rate_per_s: PerUnit = Field(0.0, description="r of the actuator tau' = -r tau + r demand [1/s] (actuated_units).")
+    force_share: Literal["mass", "installed"] | None = Field(
+        None,
+        description="How the units share a train's force where a law tells whole trains an acceleration. mass, the default: each"
+        " carries its own mass, couplers stay at rest; installed: each gives the same part of its traction_n or braking_n (0: a"
+        " trailer), and couplers carry the difference.",
+    )
 
     #: Keys whose list may be one shorter than the units: couplers.
     _couplers = ("coupler_stiffness_n_per_m", "coupler_damping_ns_per_m")
+    #: Keys by which the force of a train is shared out.
+    _shared = ("traction_n", "braking_n")
 
     @model_validator(mode="after")
     def _per_unit(self) -> TrainType:
         wrong = []
         for key in type(self).model_fields:
             value = getattr(self, key)
-            if key == "units" or value is None:
+            if key in ("units", "force_share") or value is None:
                 continue
             if isinstance(value, tuple):
                 lengths = (self.units, self.units - 1) if key in self._couplers else (self.units,)
@@ -226,19 +235,29 @@ class TrainType(Table):
                 wrong.append(f"{key} = {minimum:g}: must be above 0")
             elif key == "rotating_mass_factor" and minimum < 1:
                 wrong.append(f"{key} = {minimum:g}: must be at least 1")
+            elif (
+                self.force_share == "installed" and key in ("traction_n", "braking_n") and minimum == 0 < max(np.atleast_1d(value))
+            ):
+                continue  # a trailer, or a car without brakes
             elif key in ("traction_n", "traction_power_w", "braking_n", "braking_power_w") and minimum <= 0:
                 wrong.append(f"{key} = {minimum:g}: must be above 0 (leave it out for no limit)")
             elif minimum < 0:
                 wrong.append(f"{key} = {minimum:g}: must not be negative")
+        if self.force_share == "installed":
+            wrong += [
+                f"{key}: missing, and force_share = installed goes by it" for key in self._shared if getattr(self, key) is None
+            ]
         if self.units > 1 and min(np.atleast_1d(self.unit_length_m)) <= 0:
             wrong.append("unit_length_m: a train of several units needs lengths above 0")
         if wrong:
             raise ValueError("; ".join(wrong))
         return self
 
-    def per_unit(self, key: str, missing: float = math.inf) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """The key's value for every unit, shape (units,); couplers are padded with 0 behind the last unit."""
+    def per_unit(self, key: str, missing: float = math.inf) -> np.ndarray[Any, np.dtype[Any]]:
+        """The key's value for every unit, shape (units,); couplers padded with 0 behind the last, installed force True."""
         value = getattr(self, key)
+        if key == "force_share":
+            return np.full(self.units, value == "installed")
         if key in self._couplers:
             row = np.zeros(self.units)
             row[: self.units - 1] = value if not isinstance(value, tuple) else value[: self.units - 1]
@@ -268,47 +287,6 @@ class Train(Table):
     input_upper_mps2: float | None = Field(
         None, description="Own maximum input; the tighter of this, [bounds] and [plant] acts [m/s2]."
     )
-
-
-class Event(Table):
-    """[[event]]: something that happens at a time or place."""
-
-    kind: Literal["reroute"] = Field(description="reroute: the train takes a crossover to another track and stays there.")
-    train: Id = Field(description="The train.")
-    crossover: str | None = Field(
-        None, description="Id of the crossover (see `trainctl net show`); default: the next one to to_track."
-    )
-    to_track: Id | None = Field(None, description="Track to change to, if no crossover is named.")
-    to_edge: str | None = Field(
-        None, description="Edge of the net to go to by the shortest way, from where the train goes on to its old goal if it can."
-    )
-    time_s: NotNegative = Field(
-        0.0, description="When the route is ordered at the earliest [s]; the train changes track when it gets there."
-    )
-    position_m: float | None = Field(None, description="... once its front has passed this position [m].")
-    gap_below_m: Positive | None = Field(None, description="... once its gap to the train ahead is below this [m].")
-    speed_below_mps: Positive | None = Field(None, description="... once its speed is below this [m/s].")
-
-    @model_validator(mode="after")
-    def _where(self) -> Event:
-        if sum(key is not None for key in (self.crossover, self.to_track, self.to_edge)) != 1:
-            raise ValueError("give exactly one of crossover, to_track, to_edge")
-        return self
-
-
-class Order(Table):
-    """[[order]]: in which order trains pass an edge, whoever is there first."""
-
-    edge: str = Field(description="Edge of the net; an order holds on the same track in the other direction, too.")
-    trains: tuple[Id, ...] = Field(min_length=2, description="The trains, the first one first; others may pass between them.")
-
-    @field_validator("trains")
-    @classmethod
-    def _once(cls, trains: tuple[Id, ...]) -> tuple[Id, ...]:
-        twice = sorted(i for i, count in Counter(trains).items() if count > 1)
-        if twice:
-            raise ValueError(f"{', '.join(twice)} stands more than once")
-        return trains
 
 
 class Module(Table):
@@ -436,19 +414,20 @@ class Scenario(Table):
         if self.reference.speed_mps is None or self.reference.follow_line:
             found.append("reference: with network.sumocfg give speed_mps, the cruising speed; limits and stops are obeyed anyway")
         for k, entry in enumerate(self.event, 1):
-            if entry.to_edge is None:
+            if entry.kind == "reroute" and entry.to_edge is None:
                 found.append(f"event[{k}]: with network.sumocfg give to_edge")
         return found
 
     def consists(self) -> Consists:
         """Fixed data of all trains as arrays."""
-        types = [self.train_type[t.type] for t in self.train]
+        types = [t.type for t in self.train]
 
         def rows(key: str) -> Any:
-            return np.concatenate([k.per_unit(key) for k in types])
+            of = {name: self.train_type[name].per_unit(key) for name in set(types)}
+            return np.concatenate([of[name] for name in types])
 
         return Consists(
-            first=np.concatenate([[0], np.cumsum([k.units for k in types])]).astype(np.int64),
+            first=np.concatenate([[0], np.cumsum([self.train_type[name].units for name in types])]).astype(np.int64),
             length=rows("unit_length_m"),
             mass=rows("unit_mass_kg"),
             rotating=rows("rotating_mass_factor"),
@@ -460,6 +439,7 @@ class Scenario(Table):
             braking=rows("braking_n"),
             braking_power=rows("braking_power_w"),
             actuator_rate=rows("actuator_rate_per_s"),
+            installed=rows("force_share"),
         )
 
     def bounds_of_trains(self) -> Bounds:
