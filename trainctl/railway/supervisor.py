@@ -316,8 +316,11 @@ def too_late(
 def way_to_stop(params: Params, assumed: Assumed, speed: Floats, acceleration: Floats, step_s: float, theta: float) -> Floats:
     """Way [m] in which every train surely stops by braking as planned, or as hard as it surely can if that is less, shape (n,).
 
-    A switch that is nearer must not be turned any more. Arguments are those of ``verdict``.
+    A switch that is nearer must not be turned any more. Arguments are those of ``verdict``; where nobody is protected braking counts
+    as planned, nothing is relied on.
     """
+    if params.mode != "on":
+        return stopping_distance(np.maximum(speed, 0.0), params.service_mps2, step_s, theta)
     late = assumed.lag * np.maximum(acceleration + assumed.braking + assumed.scatter, 0.0)
     v = np.maximum(speed, 0.0) + assumed.drift + assumed.surge + late
     return stopping_distance(v, np.minimum(params.service_mps2, assumed.braking), step_s, theta) + assumed.uncertainty
