@@ -316,8 +316,8 @@ def too_late(
 def way_to_stop(params: Params, assumed: Assumed, speed: Floats, acceleration: Floats, step_s: float, theta: float) -> Floats:
     """Way [m] in which every train surely stops by braking as planned, or as hard as it surely can if that is less, shape (n,).
 
-    A switch that is nearer must not be turned any more. Arguments are those of ``verdict``; where nobody is protected braking counts
-    as planned, nothing is relied on.
+    A switch that is nearer must not be turned any more. Where nobody is protected braking counts as planned: nothing is relied on.
+    Arguments are those of ``verdict``.
     """
     if params.mode != "on":
         return stopping_distance(np.maximum(speed, 0.0), params.service_mps2, step_s, theta)
