@@ -43,6 +43,7 @@ class Orders:
     def __init__(self, p: Model, journal: Journal) -> None:
         self.p, self.journal = p, journal
         self.length = p.consists.train_length()
+        self.index = {name: i for i, name in enumerate(p.scenario.ids)}
         self.theta = p.step_theta
 
     def initial(self) -> State:
@@ -51,7 +52,7 @@ class Orders:
 
     def added(self, event: Event, s: State) -> State:
         """One more order, from outside."""
-        if event.train not in self.p.scenario.ids:
+        if event.train not in self.index:
             raise ValueError(f"train {event.train}: no such train; there are: {', '.join(self.p.scenario.ids)}")
         given = [*s.given, event.model_dump(mode="json", exclude_none=True)]
         return s._replace(pending=(*s.pending, len(self.p.scenario.event) + len(given)), given=given)
@@ -92,7 +93,7 @@ class Orders:
             event = self._event(number, s)
             if event.kind == "brake":
                 continue
-            i = self.p.scenario.ids.index(event.train)
+            i = self.index[event.train]
             lock = float(supervisor.stopping_distance(
                 np.maximum(speed[i : i + 1], 0.0), self.p.supervision.service_mps2, self.p.scenario.run.step_s, self.theta
             )[0])  # fmt: skip
@@ -137,7 +138,7 @@ class Orders:
         found = np.full(len(speed), np.nan)
         for number in s.braking:
             event = self._event(number, s)
-            i = self.p.scenario.ids.index(event.train)
+            i = self.index[event.train]
             found[i] = np.fmin(found[i], -self._deceleration(event))
         ordered: Floats = np.maximum(found, -np.maximum(speed, 0.0) / self.p.scenario.run.step_s)
         return ordered
@@ -145,7 +146,7 @@ class Orders:
     def _is_due(self, t: float, event: Event, seen: Seen, speed: Floats, ahead: Ints) -> bool:
         if event.time_s > t + 1e-9:
             return False
-        i = self.p.scenario.ids.index(event.train)
+        i = self.index[event.train]
         if not seen.present[i]:
             return False
         if event.position_m is not None and seen.position[i] < event.position_m:

@@ -63,6 +63,13 @@ def test_equal_spacing_closes_the_hole():
     assert row(links, 3, 1) == (-5000.0, -10000.0, -100.0)
 
 
+def test_with_equal_spacing_the_slots_are_those_of_each_track():
+    links = made(plan(equal=True, first_slot=-100.0), [1, 3, 1, 1, 3, 1])
+    np.testing.assert_allclose(links.slot, [-100.0, -100.0, -5100.0, -10100.0, -5100.0, -15100.0])
+    np.testing.assert_allclose(links.desired, links.slot[links.sender] - links.slot[links.receiver])
+    assert made(plan(), [1, 3, 1, 1, 3, 1]).slot.tolist() == [0.0, -5000.0, -10000.0, -15000.0, -20000.0, -25000.0]
+
+
 def test_extra_links_exist_only_while_both_are_on_one_track():
     p = plan(extra=((0, 2), (3, 5)))
     assert ["1", "3"] in graph.edges(made(p, [1, 1, 1, 1, 2, 1]), IDS)
