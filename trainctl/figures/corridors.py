@@ -24,6 +24,8 @@ from trainctl.signals import Floats
 MOST = 4
 #: Tracks that leave a corridor and come back lie beside it if they are at most so many times as long or as short as what they pass.
 BESIDE = 2.0
+#: A stop that no train reached is drawn if it lies so near the stretch trains covered, as a share of it; else it is just named.
+NEAR = 0.5
 #: Junctions and crossovers named at most; beyond, only those where trains of the run part, meet or cross over.
 NAMED = 12
 
@@ -50,6 +52,7 @@ class Corridor:
     name: str
     distance: dict[str, Floats]  # of every row of each train that is on it [m], NaN where it is elsewhere
     places: tuple[Place, ...]
+    beyond: tuple[str, ...] = ()  # stops that no train came near
 
 
 def line_of(run: Run) -> Line | None:
@@ -115,13 +118,13 @@ def corridors(run: Run, trains: Series) -> tuple[list[Corridor], str]:
         named = _stops(run, trains, distance)
         known_stops = {place.name for place in named}
         named += [place for place in _unreached(run, rails, start, per) if place.name not in known_stops]
-        ends = _ends(
-            way,
-            rails,
-            [place for place in named if place.kind == "stop"],
-            np.array([v for d in distance.values() for v in (np.nanmin(d), np.nanmax(d))]),
-        )
-        found.append(Corridor(ends, distance, tuple(sorted([*named, *_junctions(nets[0], way, known, ways, rails)]))))
+        covered = np.array([v for d in distance.values() for v in (np.nanmin(d), np.nanmax(d))])
+        spare = NEAR * float(np.ptp(covered))
+        beyond = tuple(place.name for place in named if not covered.min() - spare <= place.at_m <= covered.max() + spare)
+        named = [place for place in named if place.name not in beyond]
+        ends = _ends(way, rails, [place for place in named if place.kind == "stop"], covered)
+        places = tuple(sorted([*named, *_junctions(nets[0], way, known, ways, rails)]))
+        found.append(Corridor(ends, distance, places, beyond))
     found.sort(key=lambda c: -len(c.distance))
     shown = {name for corridor in found[:MOST] for name in corridor.distance}
     missing = len(trains.names) - len(shown)

@@ -117,7 +117,12 @@ def _coming_and_going(drawn: Drawn) -> Figure:
         panel.margins(y=0.03)
         if corridor.name:
             panel.set_title(corridor.name, loc="left", fontweight="bold")
-    axes[-1].set_title(left_out, loc="right", fontsize=7)
+        far = [f"no train came near {', '.join(corridor.beyond)}"] if corridor.beyond else []
+        panel.set_title("; ".join([*far, *([left_out] if left_out and panel is axes[-1] else [])]), loc="right", fontsize=7)
+        unreached = [place.at_m / 1000 for place in corridor.places if place.kind == "unreached"]
+        if unreached:
+            panel.update_datalim([(drawn.instants[0], at) for at in unreached])
+            panel.autoscale_view()
     style.time_axis(axes, drawn.instants[0], drawn.instants[-1], drawn.clock)
     marks = [mark for kind in MARKS for mark in _marks(axes, found, drawn, kind)]
     for panel, corridor in zip(axes, found, strict=True):

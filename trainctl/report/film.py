@@ -72,11 +72,8 @@ def film(run: Run, out: Path, *, seconds: float = 15.0, from_s: float | None = N
 
 def unpacked(packed: dict[str, str]) -> Floats:
     """What the page reads of its numbers."""
-    raw = base64.b64decode(packed["bdata"])
-    if packed["dtype"] == "i2":
-        whole = np.frombuffer(raw, "<i2").astype(float)
-        return np.where(whole == LOWEST, np.nan, whole / 1000.0)
-    return np.frombuffer(raw, "<f4").astype(float)
+    values = np.frombuffer(base64.b64decode(packed["bdata"]), f"<{packed['dtype']}").astype(float)
+    return np.where(values == LOWEST, np.nan, values / 1000.0) if packed["dtype"] == "i2" else values
 
 
 def _pictures(data: dict[str, Any], times: Floats, wanted: Floats, title: str) -> list[Image.Image]:

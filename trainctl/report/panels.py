@@ -173,6 +173,7 @@ def _corridors(drawn: Drawn) -> Iterator[Panel]:
         title = f"Train graph, {corridor.name}" if corridor.name else "Train graph"
         planned = "Rings are planned times." if any("rings" in trace for trace in traces) else ""
         note = " ".join(words for words in (IN_AND_OUT, planned, held.words) if words)
+        note += f" No train came near {', '.join(corridor.beyond)}." if corridor.beyond else ""
         if corridor is found[-1] and left_out:
             note += f" {left_out[0].upper()}{left_out[1:]}."
         yield panel(f"graph{number or ''}", title, "distance [km]", traces, note=note, places=_places(corridor.places))
@@ -217,6 +218,7 @@ def _places(found: tuple[Place, ...]) -> list[dict[str, Any]]:
             "value": place.at_m / 1000,
             "name": f"{place.name} (no train came)" if place.kind == "unreached" else place.name,
             "stop": place.kind == "stop",
+            **({"unreached": True} if place.kind == "unreached" else {}),
         }
         for place in found
     ]

@@ -110,7 +110,7 @@ def test_planned_times_stand_beside_actual_ones(merging, tmp_path):
     assert "+60 s" in {text.get_text() for text in panel.texts}
 
 
-def test_stations_that_no_train_reached_are_named_in_figure_page_and_map(merging, tmp_path):
+def test_stations_that_no_train_reached_are_named_in_figure_page_and_map(merging, tmp_path, monkeypatch):
     folder = tmp_path / "unreached"
     shutil.copytree(merging.folder, folder)
     pd.DataFrame({
@@ -126,6 +126,12 @@ def test_stations_that_no_train_reached_are_named_in_figure_page_and_map(merging
     shown = catalogue.figure(run, "train_graph")
     assert "Far" in {text.get_text() for text in shown.axes[0].texts}
     assert "stop that no train reached" in {text.get_text() for text in shown.legends[0].get_texts()}
+    monkeypatch.setattr("trainctl.figures.corridors.NEAR", 0.05)
+    (west, _), _ = corridors(run, drawable(run).trains)
+    assert west.beyond == ("Far",) and "Far" not in {place.name for place in west.places}
+    assert catalogue.figure(run, "train_graph").axes[0].get_title(loc="right") == "no train came near Far"
+    assert next(p for p in panels(drawable(run)) if p["id"] == "graph")["note"].endswith("No train came near Far.")
+    monkeypatch.undo()
     graph = next(p for p in panels(drawable(run)) if p["id"] == "graph")
     assert "Far (no train came)" in {place["name"] for place in graph["places"]}
     stops = {stop["name"]: stop for stop in animation(drawable(run))["stops"]}

@@ -71,9 +71,10 @@
   }
   const safe = (text) => text.replace(/&/g, "&amp;").replace(/</g, "&lt;");
 
-  // plotly leaves shapes out of the automatic range: an unseen pair of points at the bounds brings them in
+  // plotly leaves shapes out of the automatic range: unseen points at the bounds, and at stops that no train reached, bring them in
   function anchors(panel) {
     const values = (panel.bounds || []).filter((b) => !b.far).map((b) => b.value);
+    values.push(...(panel.places || []).filter((p) => p.unreached).map((p) => p.value));
     if (panel.least_range && !values.length) values.push(-panel.least_range / 2, panel.least_range / 2);
     return values.length ? [{ type: "scatter", mode: "markers", x: values.map(() => whole[0]), y: values, marker: { opacity: 0, size: 1 }, hoverinfo: "skip", showlegend: false }] : [];
   }
