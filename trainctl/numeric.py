@@ -42,6 +42,8 @@ def go_on(ways: Ways, length_m: Floats, displacement: Floats, row: Ints, lane_po
 class Numeric:
     """The line without a simulator: trains follow their ways by addition, and leave at the end."""
 
+    box = None  # no signals
+
     def __init__(self, line: Line) -> None:
         self.line = line
 
@@ -72,6 +74,9 @@ class Numeric:
 
     def park(self, train: int, off: bool) -> None:
         """It stays where it stands: nobody here is in anybody's way."""
+
+    def halt(self, train: int, stands: bool) -> None:
+        """Nobody sets signals here."""
 
     def linked(self, links: Links, formation: Ints) -> None:
         """Nobody looks."""

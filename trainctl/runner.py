@@ -134,6 +134,9 @@ def _opened(
     """The same for every run, whoever drives its trains."""
     every = checkpoint_every_s
     step = p.scenario.run.step_s
+    if p.obeys and (backend != "sumo" or gui is not None):
+        key = 'others = "sumo"' if p.roster.driven.any() else 'signals = "obey"'
+        raise InputError(f"traffic.{key}: SUMO sets the signals: no --backend numeric, no --gui")
     if every is not None and not (every >= step and abs(every / step - round(every / step)) < 1e-6):
         raise InputError(f"--checkpoint-every {every:g}: must be a multiple of step_s = {step:g}")
     if every is not None and gui is not None:
@@ -422,13 +425,14 @@ def open_world(p: Model, folder: Path, backend: Backend, gui: str | None = None)
     if backend == "numeric":
         return Numeric(p.line)
     from trainctl.sumo.session import Sumo
+    from trainctl.sumo.signal_box import obeyed
 
     run, (net, place) = p.scenario.run, _net(p, folder)
     if gui is not None:
         from trainctl.sumo.gui import Gui, Map
 
         return (Gui if p.placed else Map)(p.line, net, place, run.step_s, run.steps, run.record_every_s, gui)
-    return Sumo(p.line, net, place, run.step_s, run.steps, run.record_every_s)
+    return Sumo(p.line, net, place, run.step_s, run.steps, run.record_every_s, obeyed(p))
 
 
 def open_self_driven(p: Model, folder: Path) -> SelfDriven:

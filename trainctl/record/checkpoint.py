@@ -39,7 +39,7 @@ from trainctl.record.recorder import sync
 from trainctl.record.sums import PIECE, verify
 from trainctl.scenario.model import Model
 from trainctl.signals import Floats, Ints, Links, Seen, Start
-from trainctl.world import World
+from trainctl.world import SignalBox, World
 
 if TYPE_CHECKING:
     from trainctl.loop import Loop
@@ -87,11 +87,11 @@ class Tape:
 
     def __init__(self, world: World, folder: Path, saved: Saved | None = None) -> None:
         self.world, self.path = world, folder / MOVES
-        told: dict[str, Any] = (
-            saved.values["tape"] if saved else {"steps": 0, "trains": 0, "crc": 0, "routes": [], "entries": [], "parked": []}
-        )
+        none: dict[str, Any] = {"steps": 0, "trains": 0, "crc": 0, "routes": [], "entries": [], "parked": [], "halted": []}
+        told = saved.values["tape"] if saved else none
         self.steps, self.trains, self.crc = told["steps"], told["trains"], told["crc"]
-        self.routes, self.entries, self.parked = list(told["routes"]), list(told["entries"]), list(told["parked"])
+        self.routes, self.entries = list(told["routes"]), list(told["entries"])
+        self.parked, self.halted = list(told["parked"]), list(told["halted"])
         self.buffer = bytearray()
         size = 8 * self.steps * self.trains
         if saved:
@@ -104,7 +104,7 @@ class Tape:
 
     def replay(self, step: float) -> None:
         """Tell the world, which has just started, everything once more."""
-        routes, entries, parked = _by_step(self.routes), _by_step(self.entries), _by_step(self.parked)
+        routes, entries, parked, halted = (_by_step(told) for told in (self.routes, self.entries, self.parked, self.halted))
         rows = max(1, PIECE // (8 * max(self.trains, 1)))
         with self.path.open("rb") as file:
             for k in range(self.steps):
@@ -116,6 +116,8 @@ class Tape:
                     self.world.insert(train, speed)
                 for train, off in parked.get(k, ()):
                     self.world.park(train, off)
+                for train, stands in halted.get(k, ()):
+                    self.world.halt(train, stands)
                 self.world.move(piece[k % rows].copy(), step)
 
     def start(self, start: Start) -> None:
@@ -141,6 +143,16 @@ class Tape:
         """Take a train off its track, or put it back."""
         self.parked.append((self.steps, train, off))
         self.world.park(train, off)
+
+    def halt(self, train: int, stands: bool) -> None:
+        """Say that a train stands at a stop, or goes on."""
+        self.halted.append((self.steps, train, stands))
+        self.world.halt(train, stands)
+
+    @property
+    def box(self) -> SignalBox | None:
+        """Who sets the signals."""
+        return self.world.box
 
     @property
     def ways(self) -> Ways:
@@ -170,7 +182,7 @@ class Tape:
         """Everything told until now, safe on the disk, as a checkpoint names it."""
         self._flush()
         os.fsync(self.file.fileno())
-        told = {"routes": self.routes, "entries": self.entries, "parked": self.parked}
+        told = {"routes": self.routes, "entries": self.entries, "parked": self.parked, "halted": self.halted}
         return {"steps": self.steps, "trains": self.trains, "crc": self.crc, **told}
 
     def close(self) -> None:

@@ -92,8 +92,9 @@ class Model:
         if "emergency_mps2" not in stated.model_fields_set:
             v = self.fastest
             brakes = resistance(v, self.consists.train_davis()) - self.bounds.input_lower
+            ours = self.sure_braking[~self.roster.driven].min(initial=np.inf)
             wanted = math.ceil(1000.0 * max([stated.emergency_mps2, *brakes[np.isfinite(brakes)]])) / 1000.0
-            known["emergency_mps2"] = min(wanted, float(np.floor(1000.0 * self.sure_braking.min())) / 1000.0)
+            known["emergency_mps2"] = min(wanted, float(np.floor(1000.0 * ours)) / 1000.0)
             known["service_mps2"] = min(stated.service_mps2, known["emergency_mps2"])
         return stated.model_copy(update=known)
 
@@ -138,6 +139,11 @@ class Model:
     def self_driven(self) -> bool:
         """Whether the simulator drives the trains by itself: no law of ours, and no plant."""
         return bool(self.law.CLOCK == "none")
+
+    @property
+    def obeys(self) -> bool:
+        """Whether trains obey the rail signals of their net, and SUMO perhaps drives some of them."""
+        return self.roster.handed is not None
 
     @property
     def has_units(self) -> bool:

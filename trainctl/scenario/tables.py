@@ -103,6 +103,15 @@ class TrafficTable(Table):
     cooperate: tuple[str, ...] = Field(
         ("*",), description="Trains that join formations, by id; * stands for anything. The others are driven by themselves."
     )
+    others: Literal["driven", "sumo"] = Field(
+        "driven",
+        description="Trains that do not cooperate: driven: by our driver, on our plants; sumo: by SUMO, with their own vTypes.",
+    )
+    signals: Literal["ignore", "obey"] | None = Field(
+        None,
+        description="Rail signals of the net: obey: they decide who goes first; ignore: our own interlocking does. Default: obey"
+        " where there are some and not every train cooperates, or SUMO drives some of them.",
+    )
     acceleration_mps2: Positive = Field(0.4, description="Acceleration of a train or formation that is driven [m/s2].")
     deceleration_mps2: Positive = Field(0.5, description="Braking for limits, stops and trains ahead, positive [m/s2].")
     below_limit_mps: NotNegative = Field(1.0, description="Driven this far below the limits, so that a law has room above [m/s].")
