@@ -14,8 +14,16 @@
     const stated = document.documentElement.dataset.theme;
     return stated ? stated === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
   };
-  // black and the darkest blue do not show on a dark page
-  const shown = (color) => (color === "ink" || color === "#000000") ? css("--ink") : (isDark() && color === "#0072B2") ? "#6f86ff" : color;
+  // black and dark blues do not show on a dark page
+  function shown(color) {
+    if (color === "ink" || color === "#000000") return css("--ink");
+    if (!isDark() || !/^#[0-9a-f]{6}$/i.test(color)) return color;
+    if (color === "#0072B2") return "#6f86ff";
+    const parts = [1, 3, 5].map((k) => parseInt(color.slice(k, k + 2), 16)), light = (0.3 * parts[0] + 0.59 * parts[1] + 0.11 * parts[2]) / 255;
+    if (light > 0.42) return color;
+    const white = (0.42 - light) / (1 - light);
+    return "#" + parts.map((v) => Math.round(v + white * (255 - v)).toString(16).padStart(2, "0")).join("");
+  }
   const faint = (color) => { const c = shown(color); return c.startsWith("#") && c.length === 7 ? c + "2e" : c; };
 
   const hidden = new Set(); // trains that are not drawn in any plot
@@ -361,7 +369,7 @@
       pen.beginPath(); pen.arc(x, y, 7, 0, 7); pen.fill(); pen.stroke();
       if (count <= 30 || +at("zoom").value > 2) {
         pen.fillStyle = ink; pen.font = "bold 13px system-ui, DejaVu Sans, sans-serif"; pen.textAlign = "left"; write(train.name, x + 10, y - 9);
-        pen.font = "11px system-ui, DejaVu Sans, sans-serif"; pen.fillStyle = soft; pen.textAlign = "center"; write((data.per_mps * p.v).toFixed(1) + " " + data.speed_unit, x, y + 16);
+        pen.font = "11px system-ui, DejaVu Sans, sans-serif"; pen.fillStyle = soft; pen.textAlign = "center"; if (!narrow()) write((data.per_mps * p.v).toFixed(1) + " " + data.speed_unit, x, y + 16);
       }
     });
     pen.restore();
