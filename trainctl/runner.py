@@ -11,6 +11,7 @@ import time
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,7 +20,7 @@ import tomli_w
 import sumo_net
 from sumo_net import LineError
 from sumo_net.netfile import unpack
-from trainctl.errors import InputError, SimulatorError
+from trainctl.errors import InputError, SimulatorError, left_out
 from trainctl.loop import Loop
 from trainctl.metrics.run import metrics
 from trainctl.numeric import Numeric
@@ -141,6 +142,8 @@ def _opened(
         raise InputError("--checkpoint-every: a run that is watched cannot be resumed; leave out --gui")
     if backend == "sumo" and "," in (place := str(Path(out).absolute())):
         raise InputError(f"{place}: SUMO takes a comma for the end of a file's name: choose an --out without, or --backend numeric")
+    if backend == "sumo" and gui is None and find_spec("libsumo") is None:
+        raise InputError(f"{left_out('libsumo')}; without it: --backend numeric")
     partial = open_partial(out, force)
     with held(partial):
         text = p.scenario.toml()
