@@ -206,7 +206,7 @@ def test_a_run_is_shown_again_as_sumo_had_it(merging, monkeypatch):
     def move(self, *a):
         read(self, *a)
         for i in np.flatnonzero(self.seen.present).tolist():
-            shown[round(100.0 + self._time(), 3), self.ids[i]] = self.line.edges[self.seen.edge[i]]
+            shown[round(100.0 + self.now(), 3), self.ids[i]] = self.line.edges[self.seen.edge[i]]
 
     formations = []
     monkeypatch.setattr(gui.Map, "move", move)
