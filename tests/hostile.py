@@ -31,41 +31,13 @@ from trainctl.scenario.reading import examine
 
 LAWS = Path(__file__).parent / "laws"
 SAMPLED = (
-    "bang",
-    "bang",
-    "attack",
-    "attack",
-    "late",
-    "alternating",
-    "alternating",
-    "wave",
-    "noise",
-    "huge",
-    "first_brakes",
-    "first_brakes",
-    "first_brakes",
-    "crawl",
-    "full",
-    "nan",
-)
+    "bang", "bang", "attack", "attack", "late", "alternating", "alternating", "wave", "noise", "huge", "first_brakes", "first_brakes",
+    "first_brakes", "crawl", "full", "nan",
+)  # fmt: skip
 CONTINUOUS = (
-    "bang",
-    "bang",
-    "attack",
-    "attack",
-    "late",
-    "alternating",
-    "alternating",
-    "apart",
-    "noise",
-    "huge",
-    "first_brakes",
-    "first_brakes",
-    "first_brakes",
-    "full",
-    "nan",
-    "inching",
-)
+    "bang", "bang", "attack", "attack", "late", "alternating", "alternating", "apart", "noise", "huge", "first_brakes",
+    "first_brakes", "first_brakes", "full", "nan", "inching",
+)  # fmt: skip
 
 Plants = tuple[tuple[str, bool, int], ...]
 
@@ -266,13 +238,18 @@ def drawn(seed: int, place: Path, plants: Plants = PLANTS) -> Case:
     on_net = draw.random() < 0.4
     tables = base(draw, seed, kind, continuous)
     where = net_case(draw, place, folder, tables, kind) if on_net else line_case(draw, folder, tables, kind, continuous)
+    return written(draw, seed, f"{where} {kind}{' continuous' if continuous else ''}", folder, tables)
+
+
+def written(draw: random.Random, seed: int, kind: str, folder: Path, tables: dict[str, Any]) -> Case:
+    """The case, its scenario in its folder."""
     controller = tables["controller"]
     every = tables["run"]["step_s"] if controller["style"] == "inching" else draw.uniform(8.0, 60.0)
     controller["every_m"] = tables["reference"]["speed_mps"] * every
-    style, law = controller["style"], Path(controller["law"])
+    law = Path(controller["law"])
     shutil.copy(law, folder)  # so that the folder stands for itself; runs here share what was compiled of the one module
     (folder / "s.toml").write_text(tomli_w.dumps(tables | {"controller": controller | {"law": law.name}}))
-    return Case(seed, f"{where} {kind}{' continuous' if continuous else ''} {style}", folder, tables)
+    return Case(seed, f"{kind} {controller['style']}", folder, tables)
 
 
 def length_of(draw: random.Random) -> float:
@@ -359,31 +336,52 @@ def railway(draw: random.Random, place: Path) -> tuple[str, Path, list[str]]:
     return f"{name}.{variant}", folder / "a.net.xml", (folder / "routes").read_text().splitlines()
 
 
-def net_case(draw: random.Random, place: Path, folder: Path, tables: dict[str, Any], kind: str) -> str:
-    """Trains of two lengths that come, join, part and leave, on a net."""
-    name, net, routes = railway(draw, place)
-    shutil.copy(net, folder / "a.net.xml")
-    run = tables["run"]
+class Fleet(NamedTuple):
+    """What runs on a net."""
+
+    trains: dict[str, Train]  # by type
+    troubles: list[dict[str, Any]]  # [[disturbance]]
+    faults: list[dict[str, Any]]  # [[fault]]
+    braking: float  # m/s2, that can be relied on
+
+
+def coarser(draw: random.Random, tables: dict[str, Any]) -> float:
+    """Steps as they are on nets, and what is a multiple of them; the step [s]."""
+    run, top = tables["run"], tables["topology"]
     run["step_s"] = step = max(run["step_s"], 0.5)
     continuous = tables["controller"]["law"].endswith("hostile_units.py")
     if "control_period_s" in run:
         run["control_period_s"] = step * draw.choice([2, 5])
     period = run.get("control_period_s", step)
-    top = tables["topology"]
     if "delay_s" in top:
         top["delay_s"] = period * draw.choice([0, 1, 5])
         top |= {"communication_period_s": period} if continuous else {}
-    units, steep = kind.endswith("units"), 35.0 if name.startswith("hills") else 0.0
-    number = draw.randint(2, 9)
-    ids = [f"t{k}" for k in range(number)]
+    return step
+
+
+def fleet(draw: random.Random, tables: dict[str, Any], kind: str, steep: float, ids: list[str], faulty: float = 0.0) -> Fleet:
+    """Trains of one or two types on slopes of up to ``steep`` per mil, ``faulty``: how often with faults."""
+    step, sampled = tables["run"]["step_s"], tables["controller"]["law"].endswith("hostile.py")
     while True:
-        trains = {f"k{k}": machine(draw, kind, units, length_of(draw)) for k in range(draw.choice([1, 2]))}
+        trains = {f"k{k}": machine(draw, kind, kind.endswith("units"), length_of(draw)) for k in range(draw.choice([1, 2]))}
         for other in list(trains)[1:]:  # one plant for all
             trains[other] = trains[other]._replace(plant=trains["k0"].plant, brakes=min(t.brakes for t in trains.values()))
-        troubles = [disturbance(draw, step, not continuous, ids, 12_000.0) for _ in range(draw.choice([0, 0, 0, 1, 2]))]
-        braking = min(sure(t, -steep / 1000.0, troubles, [], step) for t in trains.values())
+        troubles = [disturbance(draw, step, sampled, ids, 12_000.0) for _ in range(draw.choice([0, 0, 0, 1, 2]))]
+        faults = []
+        if faulty and kind == "actuated_units" and draw.random() < faulty:
+            faults = [fault(draw, min(trains.values(), key=lambda t: t.type["units"]), ids)]
+        braking = min(sure(t, -steep / 1000.0, troubles, faults, step) for t in trains.values())
         if braking > 0.25:
-            break
+            return Fleet(trains, troubles, faults, braking)
+
+
+def net_case(draw: random.Random, place: Path, folder: Path, tables: dict[str, Any], kind: str) -> str:
+    """Trains of two lengths that come, join, part and leave, on a net."""
+    name, net, routes = railway(draw, place)
+    shutil.copy(net, folder / "a.net.xml")
+    step, run, top = coarser(draw, tables), tables["run"], tables["topology"]
+    ids = [f"t{k}" for k in range(draw.randint(2, 9))]
+    trains, troubles, _, braking = fleet(draw, tables, kind, 35.0 if name.startswith("hills") else 0.0, ids)
     steps = draw.randint(150, 400)
     duration = steps * step
     depart, rows = 0.0, []

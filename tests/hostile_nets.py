@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import random
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import nets
 from nets import both_ways, convert, net
@@ -131,3 +134,83 @@ NETS: dict[str, tuple[Callable[[Path, random.Random], list[str]], int]] = {
     "single_track": (known(single), 1), "diamond": (known(nets.diamond), 1), "ring": (known(nets.ring), 1),
     "limits": (known(nets.limits), 1),
 }  # fmt: skip
+
+
+def signalled(edges: Mapping[str, Any]) -> set[str]:
+    """Nodes of these edges that trains run through."""
+    return {begin for begin, *_ in edges.values()} & {end for _, end, *_ in edges.values()}
+
+
+def two_ways(folder: Path, draw: random.Random, signals: bool = False) -> list[str]:
+    """A way round an edge of the main line, with a branch before and one behind, close by."""
+    x = [0.0]
+    for low, high in ((500, 4000), (800, 3000), (600, 4000), draw.choice([(0.4, 3), (20, 200), (500, 3000)]), (1000, 6000)):
+        x.append(x[-1] + draw.uniform(low, high))
+    nodes = {f"n{k}": (at, 0.0) for k, at in enumerate(x)}
+    nodes |= {"m": ((x[1] + x[2]) / 2, draw.uniform(150, 600)), "s": (-500.0, -800.0), "e": (x[-1], 900.0)}
+    ends = {
+        "a": "n0 n1",
+        "b": "n1 n2",
+        "b1": "n1 m",
+        "b2": "m n2",
+        "c": "n2 n3",
+        "d": "n3 n4",
+        "z": "n4 n5",
+        "in": "s n1",
+        "out": "n3 e",
+    }
+    edges = {name: (*said.split(), {"speed": draw.choice([8, 12, 20, 25, 33, 40, 40, 55])}) for name, said in ends.items()}
+    net(folder, nodes, edges, *draw.choice([(), ("--no-internal-links",)]), signals=signalled(edges) if signals else ())
+    return ["a b c d z", "a b1 b2 c d z", "in b c d z", "in b1 b2 c out", "a b c out"]
+
+
+def laps(folder: Path, draw: random.Random, signals: bool = False) -> list[str]:
+    """A small ring that trains run round up to three times; some begin on it."""
+    r = draw.uniform(250, 1500)
+    nodes = {"w": (-r, -3000), "a": (-r, 0), "b": (0, r), "c": (r, 0), "d": (0, -r), "e": (r, -3000)}
+    edges = {"in": ("w", "a", {"speed": speed(draw)}), "out": ("c", "e", {"speed": speed(draw)})}
+    for k, (begin, end) in enumerate(pairwise("abcda")):
+        arc = [math.pi * (1.0 - k / 2.0 - part / 12.0) for part in range(7)]
+        shape = " ".join(f"{r * math.cos(angle):.2f},{r * math.sin(angle):.2f}" for angle in arc)
+        edges[begin + end] = (begin, end, {"speed": speed(draw), "shape": shape})
+    net(folder, nodes, edges, signals=signalled(edges) if signals else ())
+    lap = "ab bc cd da "
+    return [f"in {lap * k}ab bc out" for k in range(3)] + ["da ab bc out", f"bc cd da {lap}ab bc out"]
+
+
+def platforms(folder: Path, draw: random.Random, signals: bool = False) -> list[str]:
+    """Single track both ways to a station with two platforms; trains enter right before it."""
+    a = draw.uniform(50, 1500)
+    b, c = a + draw.uniform(1500, 6000), draw.uniform(400, 1200)
+    c += b
+    nodes = {
+        "w": (0, 0),
+        "w2": (0, 300),
+        "a": (a, 0),
+        "b": (b, 0),
+        "c": (c, 0),
+        "e": (c + draw.uniform(100, 2000), 0),
+        "f": (c + 1500, 500),
+    }
+    up, down = (f"{b},0 {b + 100},{y} {c - 100},{y} {c},0".split() for y in (15, -15))
+    edges = {
+        "wi": ("w", "a", {"speed": speed(draw)}), "wo": ("a", "w2", {"speed": speed(draw)}), **both_ways("m", "a", "b", speed=speed(draw)),
+        "p1": ("b", "c", {"speed": speed(draw), "shape": " ".join(up)}),
+        "p2": ("c", "b", {"speed": speed(draw), "shape": " ".join(down[::-1])}),
+        "eo": ("c", "e", {"speed": speed(draw)}), "ei": ("f", "c", {"speed": speed(draw)}),
+    }  # fmt: skip
+    net(folder, nodes, edges, signals=signalled(edges) if signals else ())
+    return ["wi m p1 eo", "ei p2 -m wo"]
+
+
+def crossing(folder: Path, draw: random.Random, signals: bool = False) -> list[str]:
+    """Two lines that cross, with a turn from the one to the other; some sides are short."""
+    away = {"w": (-1, 0), "e": (1, 0), "n": (0, 1), "s": (0, -1)}
+    nodes = {"x": (0.0, 0.0)}
+    for name, (x, y) in away.items():
+        far = draw.uniform(200, 3000)
+        nodes[name] = (x * far, y * far)
+    ends = {"wx": "w x", "xe": "x e", "nx": "n x", "xs": "x s"}
+    edges = {name: (*said.split(), {"speed": speed(draw)}) for name, said in ends.items()}
+    net(folder, nodes, edges, signals=signalled(edges) if signals else ())
+    return ["wx xe", "nx xs", "wx xs", "nx xe"]

@@ -58,7 +58,8 @@ class Recording:
         own, leading = sim.state.own, self.p.leading
         along = seen.position - ways.begin[ways.first[:-1]]
         minimum = np.minimum.reduceat(own[:, 1], leading)
-        self.rows.append((sim.time, along, own[leading, 1].copy(), minimum, seen.present.copy()))
+        there = seen.present & ~sim.state.traffic.parked  # who is parked stands beside the track
+        self.rows.append((sim.time, along, own[leading, 1].copy(), minimum, there))
         self.ways = [ways.edge[a:b].copy() for a, b in zip(ways.first[:-1], ways.first[1:], strict=True)]
 
     def tracks(self) -> Tracks:
@@ -164,13 +165,18 @@ def crossed(
 
 
 def overspeed(p: Model, tracks: Tracks) -> str | None:
-    """The maximum excess over the limit of any edge under a train."""
+    """The maximum excess over the limit of any edge under a train, as signs show it, and its own share of that."""
     worst = (OVERSPEED_MPS, "")
+    shown = np.tile(p.rails.speed_mps, (len(tracks.time), 1))
+    for since, edge, speed in zip(*p.signs, strict=True):
+        shown[tracks.time >= since - 1e-9, edge] = speed
     for i, way in enumerate(tracks.ways):
+        if p.roster.driven[i]:  # by SUMO, as its type says
+            continue
         begins = np.concatenate([[0.0], np.cumsum(p.rails.length_m[way])])
         front = tracks.along[:, i, None]
         under = (begins[:-1] < front - TOUCH_M) & (begins[1:] > front - p.consists.train_length()[i] + TOUCH_M)
-        limit = np.min(np.where(under, p.rails.speed_mps[way], np.inf), axis=1)
+        limit = np.min(np.where(under, p.roster.speed_factor[i] * shown[:, way], np.inf), axis=1)
         excess = np.where(tracks.present[:, i], tracks.speed[:, i] - limit, -np.inf)
         k = int(np.argmax(excess))
         if excess[k] > worst[0]:

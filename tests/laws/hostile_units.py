@@ -7,20 +7,21 @@ from typing import Literal, NamedTuple
 from pydantic import Field
 
 from trainctl.kernels import inlined
-from trainctl.signals import POSITION, Floats, Ints, Links, Scene, Table
+from trainctl.signals import POSITION, SPEED, Floats, Ints, Links, Scene, Table
 
 CLOCK: Literal["continuous"] = "continuous"
 ORDER: Literal["parallel"] = "parallel"
 PLANTS = ("coupled_units", "actuated_units")
 OBSERVERS = ("none", "asymptotic", "intermediate")
-MESSAGE = 1
+MESSAGE = 2
 WATCHED: tuple[str, ...] = ()
 
 #: Columns of an estimate, if there is one.
 X, V, W = 0, 1, 2
 
-STYLES = ("full", "bang", "attack", "late", "alternating", "apart", "noise", "huge", "first_brakes", "nan", "inching")
-FULL, BANG, ATTACK, LATE, ALTERNATING, APART, NOISE, HUGE, FIRST_BRAKES, NAN, INCHING = range(11)
+STYLES = ("full", "bang", "attack", "late", "alternating", "apart", "noise", "huge", "first_brakes", "nan", "inching", "twitch",
+          "neighbour")  # fmt: skip
+FULL, BANG, ATTACK, LATE, ALTERNATING, APART, NOISE, HUGE, FIRST_BRAKES, NAN, INCHING, TWITCH, NEIGHBOUR = range(13)
 
 
 class Params(Table):
@@ -68,11 +69,11 @@ def demand(
 ) -> None:  # fmt: skip
     """Write the force of every unit [N] into ``out``."""
     c, big = constants, constants.big
-    follows, gap = False, 1e9
+    follows, gap, ahead = False, 1e9, 0.0
     for k in range(len(desired)):
         if desired[k] > 0.0:
             follows = True
-            gap = min(gap, heard[k, 0] - own[0, POSITION])
+            gap, ahead = min(gap, heard[k, 0] - own[0, POSITION]), heard[k, 1]
     count = leader[0] // c.every
     fast = leader[0] // 7.0
     even = count % 2.0 == 0.0
@@ -96,6 +97,10 @@ def demand(
             f = big if follows else -big
         elif c.style == INCHING:  # to a stand and on again within each stretch: the ends of steps need not show it
             f = big if follows and 0.05 < leader[0] % c.every / c.every < 0.25 else -big
+        elif c.style == TWITCH:  # holds a round speed; pulls to the next as soon as anything in the step pushes it off
+            f = -big if own[0, SPEED] % 1.0 < 0.02 else big
+        elif c.style == NEIGHBOUR:  # goes for the one ahead while that one is slower, also when it is only now made to brake
+            f = big if not follows or ahead < own[0, SPEED] else -big
         elif c.style == NAN and chance(c.seed, fast, float(i)) < 0.003:
             f = float("nan")
         out[j] = f
@@ -105,8 +110,8 @@ def demand(
 def message(
     i: int, constants: Constants, leader: Floats, slot: float, own: Floats, estimate: Floats, estimate_rate: Floats, out: Floats
 ) -> None:
-    """Send the place of the head, shape (1,)."""
-    out[0] = own[0, POSITION]
+    """Send place and speed of the head, shape (2,)."""
+    out[0], out[1] = own[0, POSITION], own[0, SPEED]
 
 
 @inlined()

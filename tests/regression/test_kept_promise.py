@@ -124,3 +124,50 @@ def test_an_order_from_outside_leads_nowhere_protection_does_not_count_on(tmp_pa
         sim.step(3)
     [refused] = [e for e in trainctl.open(tmp_path / "run").events if e["kind"] == "reroute_refused"]
     assert "a limit of 60 m/s, where protection relies on 40 at most" in refused["reason"]
+
+
+#: Two tracks that come together on a junction, over some 15 m each.
+JOIN = {"a": (0, 0), "s": (0, -900), "b": (3000, 0), "c": (9000, 0)}
+JOINED = {"x": ("a", "b"), "y": ("s", "b"), "z": ("b", "c")}
+
+
+def in_sumo(path: str, folder: Path) -> trainctl.Run:
+    """The finished run."""
+    return trainctl.open(run(open_scenario(path), folder, "sumo").folder)
+
+
+def test_who_waits_for_another_at_a_join_stands_before_the_junction(tmp_path):
+    """On it the other one would pass beside its front, which is a collision to SUMO."""
+    nets.net(tmp_path, JOIN, JOINED)
+    nets.traffic(tmp_path, nets.train("1", "x z", 0) + nets.train("2", "y z", 300))
+    more = {"order": [{"edge": "z", "trains": ["2", "1"]}], "supervisor": {"mode": "on", "margin_m": 2.0}}
+    done = in_sumo(scenario(tmp_path, 500, **more), tmp_path / "run")
+    assert done.ok and done.collisions == 0
+    first = done.trains.astype({"train": str, "edge": str}).query("train == '1'")
+    assert first[first.speed_mps < 0.1].edge.iloc[-1] == "x"
+    assert first.edge.iloc[-1] == "z"
+
+
+def test_a_train_is_sent_elsewhere_while_it_is_on_a_junction(tmp_path):
+    nets.net(tmp_path, JOIN | {"d": (9000, 900)}, JOINED | {"w": ("b", "d")})
+    nets.traffic(tmp_path, nets.train("1", "x z", 0))
+    path = scenario(tmp_path, 200, run={"duration_s": 200.0, "step_s": 0.2})
+    with trainctl.Simulation.open(path, backend="sumo", out=tmp_path / "run") as sim:
+        while sim.position_m[0] < 3100.0:  # the junction lies from 3089 to 3124 m
+            sim.step()
+        sim.reroute("1", to_edge="z")  # where it goes already: all before is on its way too late
+        sim.step(3)
+    done = trainctl.open(tmp_path / "run")
+    assert done.ok and [e["to_edge"] for e in done.events if e["kind"] == "reroute"] == ["z"]
+
+
+def test_a_sign_may_show_more_than_the_net_where_a_train_enters(tmp_path):
+    nets.net(tmp_path, {"a": (0, 0), "b": (9000, 0)}, {"x": ("a", "b", {"speed": 8})})
+    nets.traffic(tmp_path, nets.train("1", "x", 50, departSpeed="speedLimit"))
+    (tmp_path / "a.add.xml").write_text(
+        '<additional><variableSpeedSign id="v" lanes="x_0"><step time="0" speed="30"/></variableSpeedSign></additional>'
+    )
+    config = tmp_path / "a.sumocfg"
+    config.write_text(config.read_text().replace("</input>", '<additional-files value="a.add.xml"/></input>'))
+    done = in_sumo(scenario(tmp_path, 90), tmp_path / "run")
+    assert done.ok and done.trains.speed_mps.iloc[0] > 25.0

@@ -16,6 +16,9 @@ from trainctl.signals import Bools, Floats, Ints
 
 keep_by_sources()  # before anything below is decorated
 
+#: Rounding of places [m].
+TOUCH_M = 1e-6
+
 
 class Zones(NamedTuple):
     """What is exclusive along every way; to be made anew when ways change. W rows as in ``ways``."""
@@ -35,6 +38,29 @@ def of(ways: Ways, net: Net) -> Zones:
     shared = (net.twin >= 0) & used[net.twin]
     shared |= np.bincount(across, weights=used[net.cross], minlength=len(used)) > 0
     return Zones(ways, net, *_stretches(ways, shared))
+
+
+def short_of_junctions(ways: Ways, net: Net, internal: Bools, row: Ints, s: Floats, room: Floats) -> Floats:
+    """Room (n,) [m] up to what trains must not enter yet, but not onto a junction on which another track comes in beside theirs.
+
+    Parameters
+    ----------
+    ways, net : Ways, Net
+        Of all trains.
+    internal : ndarray of bool, shape (E,)
+        Edges inside junctions.
+    row, s, room : ndarray, shape (n,)
+        Where the fronts are, and the room from there to the beginning of an edge [m]; inf: none.
+    """
+    found = room.copy()
+    for i in np.flatnonzero(np.isfinite(room) & (room > 0.0)).tolist():
+        a, b = int(row[i]), int(ways.first[i + 1])
+        k = a + int(np.searchsorted(ways.begin[a:b], s[i] + room[i] - TOUCH_M))
+        if k < b and net.joins[ways.edge[k]]:
+            while k > a and internal[ways.edge[k - 1]]:
+                k -= 1
+            found[i] = max(ways.begin[k] - s[i], 0.0)
+    return found
 
 
 class Trains(NamedTuple):

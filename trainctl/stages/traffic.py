@@ -459,7 +459,8 @@ class Traffic:
                 )  # fmt: skip
             elif one.granted and not one.join and s.waits_for[one.train] >= 0:
                 self.journal.event(t, "switch_granted", train=ids[one.train], edge=edges[one.zone])
-        return s._replace(requests=requests, waits_for=held.by.copy()), held
+        room = zones.short_of_junctions(ways, self.net, self.p.rails.internal, seen.row, seen.position, held.room)
+        return s._replace(requests=requests, waits_for=held.by.copy()), held._replace(room=room)
 
     def _look(self, ways: Ways, seen: Seen, speed: Floats, held: Held, s: State, reach: Floats) -> View:
         """What is ahead of every train."""

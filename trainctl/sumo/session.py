@@ -107,8 +107,10 @@ class Session:
 
     def route(self, train: int, edges: tuple[str, ...]) -> None:
         """Give a train another route."""
-        self._call(self.api.vehicle.setRoute, self.ids[train], normal(edges))
         line, row, before = self.line, int(self.seen.row[train]), self.ways.first
+        # For SUMO who is between two edges is on the first of them still.
+        past = normal(line.edges[e] for e in self.ways.edge[before[train] : row].tolist())[-1:] if edges[0].startswith(":") else []
+        self._call(self.api.vehicle.setRoute, self.ids[train], [*past, *normal(edges)])
         self.ways = rerouted(self.ways, train, row, [line.index[e] for e in edges], line.start_m, line.length_m)
         self.seen = self.seen._replace(row=self.seen.row + self.ways.first[:-1] - before[:-1])
 
@@ -286,6 +288,9 @@ class Sumo(Session):
             return
         if train in self.pending:
             self._call(self.api.vehicle.remove, name)
+        edge = self.line.edges[self.ways.edge[self.ways.first[train]]]
+        if speed > self.api.lane.getMaxSpeed(f"{edge}_0"):  # a sign shows more than the net has
+            self._call(self.api.edge.setMaxSpeed, edge, speed)
         if f"way_{name}" not in self.api.route.getIDList():
             self._call(self.api.route.add, f"way_{name}", normal(self.routes[train]))
         self._call(
@@ -313,7 +318,7 @@ class Sumo(Session):
             return
         if stands:
             self._stop_here(self.ids[train], 0)
-        else:
+        elif self.api.vehicle.getStops(self.ids[train], 1):  # whoever comes back from where it was parked has none any more
             self._call(self.api.vehicle.resume, self.ids[train])
 
     def _stop_here(self, name: str, flags: int) -> None:
