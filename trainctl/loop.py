@@ -197,7 +197,9 @@ class Loop(Steps):
 
     def outcome(self) -> dict[str, Any]:
         """What run.json says of the finished run."""
-        return self.record.alarms.outcome(self.not_entered, self.state.watch.alarms)
+        sent, received = self.state.messages.counted.tolist()
+        told = self.record.alarms.outcome(self.not_entered, self.state.watch.alarms)
+        return told | ({"messages_sent": sent, "messages_received": received} if sent else {})
 
     def _start(self) -> None:
         """Put the trains on the railway: those that are placed, and those due at time 0."""

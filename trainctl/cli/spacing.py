@@ -12,7 +12,7 @@ from trainctl.errors import InputError
 
 def spacing(
     given: dict[str, Any], rows: str | None, out: Path, formats: tuple[str, ...], workers: int | None, as_json: bool,
-    as_latex: bool, sumo: bool,
+    sumo: bool,
 ) -> None:  # fmt: skip
     """Search, and show what was found.
 
@@ -22,7 +22,7 @@ def spacing(
         Numbers of the plan that are not its usual ones.
     rows : str, optional
         Rows of the table, separated by commas; default all.
-    out, formats, workers, as_json, as_latex, sumo
+    out, formats, workers, as_json, sumo
         As the command has them.
     """
     from trainctl.studies import spacing as study
@@ -36,12 +36,10 @@ def spacing(
     with Progress("spacing", sys.stderr.isatty()) as advance:
         table = study.compare(plan, out, wanted, workers, sumo, advance)
     pictures = shown.figure(table, plan, out / "spacing", formats)
-    lines = stops.reference_lines(plan)
+    lines, tex = stops.reference_lines(plan), out / "spacing.tex"
+    tex.write_text(shown.latex(table, plan), encoding="utf-8")
     if as_json:
-        show_json({"plan": plan._asdict(), "lines": lines, "rows": table, "figures": pictures})
-        return
-    if as_latex:
-        say(shown.latex(table, plan))
+        show_json({"plan": plan._asdict(), "lines": lines, "rows": table, "figures": pictures, "latex": tex})
         return
     kmh, percent = 3.6 * plan.speed_mps, 100.0 * plan.brake_scatter
     printed = listing(
@@ -55,5 +53,5 @@ def spacing(
         say(f"{name} braking distance: {value:.4g} m")
     for words in shown.reasons(table):
         say(words)
-    for path in pictures:
+    for path in [*pictures, tex]:
         say(path)

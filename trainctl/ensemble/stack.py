@@ -78,7 +78,7 @@ def kind(p: Model) -> tuple[Any, ...]:
     top = s.topology
     return (
         p.law, p.params, p.plant, p.plant_params, p.observer, p.observer_params, id(p.line),
-        s.run.model_copy(update={"seed": None}), top.loss, top.delay_s, top.range_m, top.communication_period_s, s.fault,
+        s.run.model_copy(update={"seed": None}), top.loss, top.delay_s, top.range_m, top.communication_period_s, s.channel, s.fault,
         p.consists.first.tobytes(), s.ids, reference.breaks.tobytes(), reference.position[:, 1:].tobytes(),
         s.bounds.coupler_lower_m, s.bounds.coupler_upper_m,
     )  # fmt: skip

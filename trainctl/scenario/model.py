@@ -19,6 +19,7 @@ from trainctl.railway import signs, supervisor
 from trainctl.railway.authority import DRIVER_MARGIN_M
 from trainctl.railway.signs import Signs
 from trainctl.scenario import limits, promise
+from trainctl.scenario.channel import exchanges
 from trainctl.scenario.tables import Scenario, TrafficTable
 from trainctl.signals import POSITION, SPEED, Bounds, Consists, Floats, Ints, Links, Reference, Scene, leader_at, restrict
 from trainctl.topology import convoys, graph
@@ -202,7 +203,14 @@ class Model:
         period = top.communication_period_s or run.control_period_s or run.step_s
         names = np.array([draws.word(name) for name in self.scenario.ids], np.int64)
         key = np.tile(np.array(draws.key(run.seed or 0), np.int64), (len(names), 1))
-        return Radio(top.loss, round(top.delay_s / period), top.range_m or np.inf, key, names)
+        c, of = self.scenario.channel, {name: i for i, name in enumerate(self.scenario.ids)}
+        outages = [(of.get(e.train, -1), e.time_s, e.until_s) for e in self.scenario.event if e.kind == "outage"]
+        return Radio(
+            top.loss, round(top.delay_s / period), top.range_m or np.inf, key, names, 1.0 if c.bad_loss is None else c.bad_loss,
+            period / c.good_s if c.good_s else 0.0, period / c.bad_s if c.bad_s else 1.0, c.delay_spread_s / period,
+            c.delay_shape == "exponential", -1.0 if c.send_beyond_m is None else c.send_beyond_m,
+            exchanges(c.send_every_s or 0.0, period), np.array(outages, np.float64).reshape(-1, 3),
+        )  # fmt: skip
 
     @property
     def spacing(self) -> convoys.Spacing:

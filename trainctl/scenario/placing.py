@@ -165,8 +165,10 @@ def on_the_line(scenario: Scenario, line: Line) -> list[str]:
             )
     where = {t.id: (t.track, t.position_m, t) for t in scenario.train}
     for k, event in sorted(enumerate(scenario.event, 1), key=lambda e: e[1].time_s):
+        if event.kind != "reroute":
+            continue
         track, at_least, t = where[event.train]
-        if event.kind == "reroute" and track in line.track_ids:
+        if track in line.track_ids:
             where[event.train] = (*_reroute(f"event[{k}]", event, scenario, line, track, at_least, found), t)
     return found
 

@@ -281,7 +281,7 @@ def _events(scenario: Scenario, ids: list[str], rails: Rails) -> list[str]:
     edges = [edge for edge, inside in zip(rails.edges, rails.internal, strict=True) if not inside]
     for k, event in enumerate(scenario.event, 1):
         for key, name, known, what in (("train", event.train, ids, "train"), ("to_edge", event.to_edge, edges, "edge for trains")):
-            if name is not None and name not in known:
+            if name is not None and name not in known and not (key == "train" and event.of_all):
                 some = f"{', '.join(known[:8])}{' ...' if len(known) > 8 else ''}"
                 found.append(f"event[{k}].{key} = {name}: no such {what}; there are: {some}")
     return found

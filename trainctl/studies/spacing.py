@@ -154,11 +154,10 @@ def measured(plan: StopsPlan, row: str, spacing: float, out: Path) -> dict[str, 
         return numbers
     values, trains = run.metrics, run.trains
     speed = float(trains.groupby("train", observed=True)["speed_mps"].mean().mean())
-    exchanges = 1.0 / (tables["topology"].get("communication_period_s") or period)
     return numbers | {
         "journey_time_s": 100_000.0 / speed, "energy_kwh_per_train_km": values.get("energy.traction_kwh_per_train_km"),
         "jerk_rms_mps3": values.get("comfort.jerk_rms_mps3"), "string_gain": values.get("string.l2_gain"),
-        "messages_per_train_s": exchanges,
+        "messages_per_train_s": run.info["messages_sent"] / plan.trains / float(tables["run"]["duration_s"]),
     }  # fmt: skip
 
 

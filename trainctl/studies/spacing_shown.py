@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from trainctl.studies.compare import escaped
 from trainctl.studies.stops import REFUSED, StopsPlan, reference_lines
 
 #: Columns of the printed table -> keys.
@@ -55,24 +56,13 @@ def _number(value: Any) -> str:
 
 
 def latex(table: Sequence[Mapping[str, Any]], plan: StopsPlan) -> str:
-    """A table for LaTeX with booktabs; needs nothing else."""
-    lines = [
-        rf"\begin{{tabular}}{{l{'r' * (len(COLUMNS) - 1)}}}",
-        r"\toprule",
-        " & ".join(map(_tex, COLUMNS)) + r" \\",
-        r"\midrule",
-    ]
-    lines += [" & ".join("--" if cell is None else _tex(_number(cell)) for cell in cells(row)) + r" \\" for row in table]
-    lines += [r"\midrule"]
-    blank = " & " * (len(COLUMNS) - 2)
-    lines += [rf"{name} braking distance & {value:.4g}{blank} \\" for name, value in reference_lines(plan).items()]
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
-
-
-def _tex(text: str) -> str:
-    for a, b in (("%", r"\%"), ("_", r"\_"), ("&", r"\&"), ("m/s3", r"m/s\textsuperscript{3}")):
-        text = text.replace(a, b)
-    return text
+    """The table as a ``tabular`` of booktabs, a dash where there is nothing."""
+    last = len(COLUMNS) - 1
+    rows = [[escaped("--" if cell is None else _number(cell)) for cell in cells(row)] for row in table]
+    lines = [[f"{name} braking distance", f"{value:.4g}", *[""] * (last - 1)] for name, value in reference_lines(plan).items()]
+    blocks = ([[*map(escaped, COLUMNS)]], rows, lines)
+    body = "\n\\midrule\n".join("\n".join(" & ".join(row) + r" \\" for row in block) for block in blocks)
+    return f"% \\usepackage{{booktabs}}\n\\begin{{tabular}}{{l{'r' * last}}}\n\\toprule\n{body}\n\\bottomrule\n\\end{{tabular}}\n"
 
 
 def figure(table: Sequence[Mapping[str, Any]], plan: StopsPlan, path: Path, formats: Sequence[str] = ("png",)) -> list[Path]:

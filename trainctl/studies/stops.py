@@ -4,9 +4,9 @@ How close trains may follow each other under a law: the smallest desired spacing
 
 The question is the same for all laws. Trains on a level line run at one speed, at their desired spacing but for small errors.
 Then the first one brakes as hard as it can, by an order of its own, to a stand; the reference of the others does not change, so
-they learn of it by messages alone. Messages come a period late, and some not at all. Brakes and running resistance are unlike
-from train to train, and no law is told by how much; a force nobody knows of acts on each, and measured positions are off (for
-continuous laws they are exact: such a law has no instants to measure at). Nothing protects the trains.
+they learn of it by messages alone. Messages come a period late, and some not at all, mostly in bursts. Brakes and running
+resistance are unlike from train to train, and no law is told by how much; a force nobody knows of acts on each, and measured
+positions are off (for continuous laws they are exact: such a law has no instants to measure at). Nothing protects the trains.
 
 A stop fails if two trains touch, or one is faster than the line. The **smallest safe spacing** is found by bisection with the
 first ``searched`` stops; that spacing and some per cent less and more are then run with all of them, for safety need not be
@@ -70,7 +70,9 @@ class StopsPlan(NamedTuple):
     speed_error_mps: float = 0.2
     brakes_s: float = 20.0  # when the first train brakes
     delay_s: float = 1.0
-    loss: float = 0.1
+    loss: float = 0.02  # of messages in good times; in bad ones none arrives
+    good_s: float = 60.0  # mean length of good times
+    bad_s: float = 3.0
 
     @property
     def brakes_mps2(self) -> float:
@@ -139,6 +141,8 @@ def scenario(plan: StopsPlan, row: str, spacing: float, stops: Sequence[int]) ->
     )
     period = tables["run"].get("control_period_s", 1.0)
     tables["topology"] = {**tables["topology"], "delay_s": math.ceil(plan.delay_s / period) * period}
+    if plan.bad_s > 0.0:
+        tables["channel"] = {"good_s": max(plan.good_s, period), "bad_s": max(plan.bad_s, period)}
     tables["disturbance"] = [
         {"on": "input", "shape": "uniform", "amplitude_mps2": plan.input_mps2},
         {"on": "resistance", "shape": "constant", "error_percent": percent},
@@ -273,6 +277,7 @@ def wrong(plan: StopsPlan) -> list[str]:
         ("speed-mps", f"above 1, at most {plan.line_mps:g}", 1.0 < plan.speed_mps < plan.line_mps),
         ("loss", "0 .. 0.99", 0.0 <= plan.loss <= 0.99),
         ("delay-s", "at least 0", plan.delay_s >= 0.0),
+        ("bad-s", "0, no bad times, or at least 1", plan.bad_s == 0.0 or plan.bad_s >= 1.0),
         ("brake-scatter", "0 .. 0.5", 0.0 <= plan.brake_scatter <= 0.5),
     )
     return [f"--{key}: must be {rule}" for key, rule, holds in rules if not holds]
