@@ -176,7 +176,7 @@ def _occupy(
         return [Patch(facecolor=style.GREY, edgecolor=style.GREY, alpha=0.4, label="block held")]
     found = [Patch(facecolor=style.GREY, alpha=0.7, label="train")] if any(held.length.values()) else []
     if held.rates:
-        found.append(Patch(facecolor=style.GREY, alpha=0.3, label=f"braking distance at {held.rate} m/s$^2$"))
+        found.append(Patch(facecolor=style.GREY, alpha=0.3, label=f"braking distance at {held.rate} m/s²"))
     return found
 
 

@@ -80,3 +80,17 @@ def test_the_notebook_runs_from_top_to_bottom(notebook, tmp_path, monkeypatch):
 def test_a_notebook_has_no_output(notebook):
     book = json.loads((ROOT / notebook).read_text())
     assert book["nbformat"] == 4 and all(not cell.get("outputs") and cell.get("execution_count") is None for cell in book["cells"])
+
+
+def test_every_picture_of_the_gallery_is_there_and_small_and_drawn_by_its_commands():
+    spec = importlib.util.spec_from_file_location("gallery", ROOT / "tools/gallery.py")
+    gallery = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(gallery)
+    text = gallery.PAGE.read_text()
+    drawn = gallery.pictures(text)
+    assert len(drawn) == len(list(gallery.PAGE.parent.glob("*.png"))) >= 5
+    for run, figure in drawn:
+        assert 5_000 < (gallery.PAGE.parent / f"{run}-{figure}.png").stat().st_size < 120_000
+        assert any(
+            line.startswith(f"trainctl run {run}") for line in gallery.commands(text)
+        ) and f"trainctl plot runs/{run}" in gallery.commands(text)
