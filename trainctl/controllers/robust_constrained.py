@@ -279,7 +279,7 @@ def warnings(params: Params, scene: Scene, tracks: Sequence[int] | None = None) 
     ]
     if deaf:
         found.append(
-            f"link: the law has no spacing constraint and not every follower receives from its predecessor on the track: {_some(deaf)}; "
+            f"link: the law has no spacing constraint and not every follower receives from its predecessor: {_some(deaf)}; "
             "such graphs can end in a collision from starts that braking would save"
         )
     found += _assumption_1(scene)

@@ -202,7 +202,7 @@ class Orders:
         cure = '[supervisor] mode = "on" does'
         if over.speed_mps < speed[i]:
             raise Refused(
-                f"crossover {over.id} allows {over.speed_mps:g} m/s, the train runs at {speed[i]:g} m/s, and nothing would brake it:"
+                f"crossover {over.id} allows {over.speed_mps:g} m/s, the train runs at {speed[i]:g} m/s and nothing would brake it:"
                 f" {cure}"
             )
         join = over.start_m + over.length_m
