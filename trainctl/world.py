@@ -54,7 +54,7 @@ class World(Protocol):
         """Say that a train stands at a stop of its own, or goes on: where signals are obeyed, it asks for none meanwhile."""
 
     def linked(self, links: Links, formation: Ints) -> None:
-        """Who hears whom from now on, and which formation (n,) every train is in: for simulators that show it."""
+        """Who receives from whom from now on, and which formation (n,) every train is in: for simulators that show it."""
 
     def move(self, displacement: Floats, step: float) -> None:
         """Let every train move by ``displacement`` (n,) [m] within one step, and end the step."""
