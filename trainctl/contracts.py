@@ -90,7 +90,7 @@ class ContinuousLaw(Protocol):
     ) -> None:  # fmt: skip
         """Write the demanded force of each unit [N] into ``out``.
 
-        ``desired`` (k,) and ``heard`` (k, w) are the rows of the k links on which train ``i`` receives; ``age`` [s] is how old it is
+        ``desired`` (k,) and ``heard`` (k, w) are the rows of the k links to train ``i``; ``age`` [s] is how old ``heard`` is
         (0 in the exact mode).
         """
 
