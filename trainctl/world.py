@@ -33,6 +33,13 @@ class World(Protocol):
     def park(self, train: int, off: bool) -> None:
         """Take a train that stands off its track, or put it back: both come with the next ``move``, in which it stands."""
 
+    def turn(self, train: int, edges: tuple[str, ...], arrival: float) -> None:
+        """Let a train that stands turn back with the next ``move``, in which it stands: its rear becomes its front.
+
+        ``edges``, internal ones included, begins with the twin of the edge it is on; ``arrival`` is where it leaves on the last of
+        them [m], inf: at its end.
+        """
+
     def linked(self, links: Links, formation: Ints) -> None:
         """Who hears whom from now on, and which formation (n,) every train is in: for simulators that show it."""
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 STANDS_MPS = 0.05
 
 #: What is waited at; ``Wait.place`` is one of them.
-TRAIN, SWITCH, ENTRY = "train", "switch", "entry"
+TRAIN, SWITCH, ENTRY, TURN = "train", "switch", "entry", "turn"
 
 
 class Wait(NamedTuple):

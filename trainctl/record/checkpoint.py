@@ -85,10 +85,13 @@ class Tape:
     def __init__(self, world: World, folder: Path, saved: Saved | None = None) -> None:
         self.world, self.path = world, folder / MOVES
         told: dict[str, Any] = (
-            saved.values["tape"] if saved else {"steps": 0, "trains": 0, "crc": 0, "routes": [], "entries": [], "parked": []}
+            saved.values["tape"]
+            if saved
+            else {"steps": 0, "trains": 0, "crc": 0, "routes": [], "entries": [], "parked": [], "turns": []}
         )
         self.steps, self.trains, self.crc = told["steps"], told["trains"], told["crc"]
         self.routes, self.entries, self.parked = list(told["routes"]), list(told["entries"]), list(told["parked"])
+        self.turns = list(told["turns"])
         self.buffer = bytearray()
         # unbuffered: what did not fit on the disk must not come back when the file is closed
         self.file = open(self.path, "r+b" if saved else "wb", buffering=0)  # noqa: SIM115  closed by close()
@@ -110,7 +113,7 @@ class Tape:
 
     def replay(self, step: float) -> None:
         """Tell the world, which has just started, everything once more."""
-        routes, entries, parked = _by_step(self.routes), _by_step(self.entries), _by_step(self.parked)
+        routes, entries, parked, turns = (_by_step(told) for told in (self.routes, self.entries, self.parked, self.turns))
         rows = max(1, PIECE // (8 * max(self.trains, 1)))
         with self.path.open("rb") as file:
             for k in range(self.steps):
@@ -122,6 +125,8 @@ class Tape:
                     self.world.insert(train, speed)
                 for train, off in parked.get(k, ()):
                     self.world.park(train, off)
+                for train, (edges, arrival) in turns.get(k, ()):
+                    self.world.turn(train, tuple(edges), np.inf if arrival is None else arrival)
                 self.world.move(piece[k % rows].copy(), step)
 
     def start(self, start: Start) -> None:
@@ -147,6 +152,11 @@ class Tape:
         """Take a train off its track, or put it back."""
         self.parked.append((self.steps, train, off))
         self.world.park(train, off)
+
+    def turn(self, train: int, edges: tuple[str, ...], arrival: float) -> None:
+        """Let a train turn back."""
+        self.turns.append((self.steps, train, [list(edges), None if np.isinf(arrival) else arrival]))
+        self.world.turn(train, edges, arrival)
 
     @property
     def ways(self) -> Ways:
@@ -176,7 +186,7 @@ class Tape:
         """Everything told until now, safe on the disk, as a checkpoint names it."""
         self._flush()
         os.fsync(self.file.fileno())
-        told = {"routes": self.routes, "entries": self.entries, "parked": self.parked}
+        told = {"routes": self.routes, "entries": self.entries, "parked": self.parked, "turns": self.turns}
         return {"steps": self.steps, "trains": self.trains, "crc": self.crc, **told}
 
     def close(self) -> None:
@@ -336,6 +346,8 @@ def restore(loop: Loop, tape: Tape, saved: Saved) -> None:
     if not (np.array_equal(seen.position, saved.arrays["seen.0"]) and np.array_equal(seen.edge, saved.arrays["seen.1"])):
         raise SimulatorError("the simulator did not come back to where it was: other versions or another network")
     values = saved.values["state"]
+    going = again(f"state.{loop.state._fields.index('traffic')}", loop.state.traffic, saved.arrays, values)
+    loop.runs_round(going.leg, [], loop.state.watch)
     # What law and plant made of the last change of topology has shapes and parts of its own: made again, then filled.
     made = again("made_of", MADE_OF, saved.arrays, values)
     scene = loop.p.scene(made[1], made[2], made[0])

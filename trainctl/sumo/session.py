@@ -23,7 +23,7 @@ import numpy as np
 from sumo_net import Line
 from trainctl.errors import CouplingError, SimulatorError
 from trainctl.numeric import LEAVES_M, lay_out, way_lengths
-from trainctl.railway.ways import Ways, rerouted
+from trainctl.railway.ways import Ways, rerouted, turned
 from trainctl.runs.sumo_logs import elements
 from trainctl.signals import Bools, Floats, Ints, Links, Seen, Start
 from trainctl.sumo.causes import SPEED_MODE_FREE, cause
@@ -44,6 +44,9 @@ PLANNED_M = 1.0
 
 #: A stop that a train parks at, until it is told to resume: its time [s], and the flag that says so.
 PARKS_S, PARKING = 1e6, 1
+
+#: SUMO puts a train that turns so far beyond its place [m]; told to go as far before it turns, it stands where it should.
+TURNS_M = 1e-3
 
 #: What SUMO says about drivers who decide so rarely.
 OF_IDLING = ("Warning: Given action step length", "Warning: Action step length")
@@ -256,7 +259,10 @@ class Sumo(Session):
         self._plan = _direct(vehicle.setActionStepLength)
         self.ids, self.routes, self.departs_m = list(start.ids), list(start.routes), start.lane_position
         self.ways = lay_out(self.line, start)
-        self.arrival = np.full(len(self.ids), np.inf) if start.arrival is None else start.arrival
+        self.arrival = np.full(len(self.ids), np.inf) if start.arrival is None else start.arrival.copy()
+        self.length = start.length
+        self.turning: list[tuple[int, tuple[str, ...], float]] = []
+        self.taken_off: set[int] = set()
         self.way_end = self._way_end()
         self.coming: list[tuple[int, float]] = []
         self.returning: list[int] = []
@@ -370,6 +376,12 @@ class Sumo(Session):
             startPos=max(place - 1.0, 0.0),
         )  # fmt: skip
 
+    def turn(self, train: int, edges: tuple[str, ...], arrival: float) -> None:
+        """Let a train turn back with the next ``move``: SUMO does as soon as the route says so, so it has not until now."""
+        here = self.line.edges[self.seen.edge[train]]
+        self._call(self.api.vehicle.setRoute, self.ids[train], [here, *normal(edges)])
+        self.turning.append((train, edges, arrival))
+
     def linked(self, links: Links, formation: Ints) -> None:
         """Nobody looks."""
 
@@ -378,11 +390,16 @@ class Sumo(Session):
         before, row, present = self.seen.position, self.seen.row, self.seen.present
         wanted = np.where(present, before + displacement, before)
         left = self.ways.begin[row] + self.line.length_m[self.ways.edge[row]] - wanted
-        self._call(self._command, np.flatnonzero(present), displacement / step)
+        speeds = displacement / step
+        speeds[[i for i, _, _ in self.turning]] = TURNS_M / step
+        self._call(self._command, np.flatnonzero(present), speeds)
         if self.idle:
             for i in np.flatnonzero(present & (left < PLANNED_M)).tolist():
                 self._call(self._plan, self.ids[i], 0.0)
         self._call(self.api.simulationStep)
+        for train, edges, arrival in self.turning:
+            wanted[train], left[train] = self._turned(train, edges, arrival)
+        self.turning.clear()
         present = present & ~self._left(wanted, present)
         now = self._read(wanted, left, present)
         wrong = np.flatnonzero(np.abs(now.position - wanted) > TOLERANCE_M)
@@ -399,11 +416,31 @@ class Sumo(Session):
             self.coming.clear()
         self.seen = now
 
+    def _turned(self, train: int, edges: tuple[str, ...], arrival: float) -> tuple[float, float]:
+        """Take over the way of a train that has turned: where its front should be now, and how far that is from its edge's end."""
+        line, row, before = self.line, int(self.seen.row[train]), self.ways.first
+        self.ways, row, place = turned(
+            self.ways, train, row, float(self.seen.position[train]), float(self.length[train]), [line.index[e] for e in edges],
+            line.start_m, line.length_m,
+        )  # fmt: skip
+        rows = self.seen.row + self.ways.first[:-1] - before[:-1]
+        rows[train] = row
+        self.seen = self.seen._replace(row=rows)
+        self.arrival[train] = arrival
+        self.way_end = self._way_end()
+        if math.isfinite(arrival):  # SUMO takes a place of arrival for that of any route, so it knows of none
+            self.taken_off.add(train)
+        return float(self.ways.begin[row]) + place, float(line.length_m[self.ways.edge[row]]) - place
+
     def _left(self, wanted: Floats, present: Bools) -> Bools:
         """Which trains have left the net at the end of their way."""
         near = present & (wanted > self.way_end - LEAVES_M - TOLERANCE_M)
         if near.any():
             gone = set(self.api.simulation.getArrivedIDList())
+            for i in self.taken_off.intersection(np.flatnonzero(near & (wanted > self.way_end - LEAVES_M)).tolist()):
+                if self.ids[i] not in gone:
+                    self._call(self.api.vehicle.remove, self.ids[i], self.api.constants.REMOVE_ARRIVED)
+                    gone.add(self.ids[i])
             near &= np.array([name in gone for name in self.ids])
         return near
 
