@@ -75,9 +75,8 @@ class Consists(NamedTuple):
     def turned(self, turned: Bools) -> Consists:
         """The same with the units of some trains (n,) in the opposite order."""
         rows, between = (turned_rows(self.first, turned, couplers) for couplers in (False, True))
-        couplers = {"stiffness": self.stiffness[between], "damping": self.damping[between]}
-        units = {name: np.ascontiguousarray(getattr(self, name)[rows]) for name in self._fields[1:] if name not in couplers}
-        return self._replace(**units, **couplers)
+        units = Consists(self.first, *(row[rows] for row in self[1:]))
+        return units._replace(stiffness=self.stiffness[between], damping=self.damping[between])
 
 
 def turned_rows(first: Ints, turned: Bools, couplers: bool = False) -> Ints:

@@ -32,7 +32,7 @@ class Yard(NamedTuple):
         """The nearest place at ``front`` or beyond [m]; inf: none."""
         for begin, end in self.places.tolist():
             if front <= end + ROUNDING_M:
-                return max(float(front), begin)
+                return max(front, float(begin))
         return float("inf")
 
     def aim(self, front: float, braking: float, into: float) -> float:

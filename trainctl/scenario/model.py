@@ -21,7 +21,21 @@ from trainctl.railway.authority import DRIVER_MARGIN_M
 from trainctl.railway.signs import Signs
 from trainctl.scenario import limits, promise
 from trainctl.scenario.tables import Scenario, TrafficTable
-from trainctl.signals import POSITION, SPEED, Bounds, Consists, Floats, Ints, Links, Reference, Scene, leader_at, restrict
+from trainctl.signals import (
+    POSITION,
+    SPEED,
+    Bools,
+    Bounds,
+    Consists,
+    Floats,
+    Ints,
+    Links,
+    Reference,
+    Scene,
+    leader_at,
+    restrict,
+    turned_rows,
+)
 from trainctl.topology import convoys, graph
 from trainctl.topology.exchange import Radio
 

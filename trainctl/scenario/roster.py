@@ -61,9 +61,7 @@ class Roster(NamedTuple):
     like: tuple[str, ...]  # who enters as fast as is safe, but no faster than those on its edge: their "avg", the "last"; else ""
     top_speed: Floats  # (n,) m/s
     speed_factor: Floats  # (n,) share of a speed limit that a train keeps to, at most 1: nobody is driven above a limit
-    legs: tuple[
-        tuple[tuple[str, ...], ...], ...
-    ]  # its route in parts, up to its turns and its end: edge ids, with internal ones
+    legs: tuple[tuple[tuple[str, ...], ...], ...]  # its route in parts, up to its turns and its end: edge ids, with internal ones
     stops: tuple[tuple[Stop, ...], ...]
     cooperates: Bools  # (n,)
     vclass: tuple[str, ...]
