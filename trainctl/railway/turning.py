@@ -38,13 +38,13 @@ class Yard(NamedTuple):
     def aim(self, front: float, braking: float, into: float) -> float:
         """Where a train at ``front`` that would stand ``braking`` [m] farther on is to come to its stand [m].
 
-        It brakes as soon as it may turn; ``into`` [m] is how far beyond it aims, if there is room.
+        It brakes as soon as it may turn; ``into`` [m] is how far into such track it aims at least, if there is room.
         """
         where = self.next(front)
         if where > self.last:
             return self.last
-        room = float(self.places[self.places[:, 1] >= where - ROUNDING_M][0, 1]) - where
-        return min(self.next(where + max(braking, min(into, 0.5 * room))), self.last)
+        begin, end = self.places[self.places[:, 1] >= where - ROUNDING_M][0].tolist()
+        return min(self.next(max(where + braking, begin + min(into, 0.5 * (end - begin)))), self.last)
 
     def holds(self, front: float) -> bool:
         """Whether a train with its front there may turn."""

@@ -153,9 +153,12 @@ class Turns:
             rows[i], position[i], present[i] = row, there.begin[row] + place, False
             asks = np.arange(len(rows)) == i
             then = leg + asks
-            back = self.back(then)
+            back, along_it = self.back(then), zones.of(there, self.net, self.later)
+            # It is on the track that others wait for, so it comes before whoever waits.
+            begins = np.unique(along_it.begins[row : there.first[i + 1]])
+            first = [(i, int(there.edge[k]), False) for k in begins.tolist() if k >= 0]
             granted, held, _ = interlocking.request(
-                zones.of(there, self.net, self.later), requests, rows, position, self.length, present, reach,
+                along_it, {**requests, "stretches": [*first, *requests["stretches"]]}, rows, position, self.length, present, reach,
                 self.p.supervision.margin_m + DRIVER_MARGIN_M, asks, None, standing & ~asks, ordered(there, rows), asks, back,
             )  # fmt: skip
             if held.room[i] <= 0.0:
