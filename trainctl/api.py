@@ -30,8 +30,8 @@ from trainctl.runner import Backend
 from trainctl.runs import run as recorded
 from trainctl.runs.outcome import summary
 from trainctl.scenario.build import open_scenario
+from trainctl.scenario.events import Event
 from trainctl.scenario.reading import mistakes
-from trainctl.scenario.tables import Event
 from trainctl.signals import POSITION, SPEED, Floats
 
 if TYPE_CHECKING:

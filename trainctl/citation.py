@@ -72,6 +72,30 @@ PAPERS = {
     ),
 }  # fmt: skip
 
+#: What the standards of the field follow, laws without claims of their own here: name of the law -> the description.
+STANDARDS = {
+    "time_headway": Work(
+        "darbha_v2v_2018", "misc", ("Swaroop Darbha", "Shyamprasad Konduri", "Prabhakar R. Pagilla"),
+        "Benefits of V2V Communication for Autonomous and Connected Vehicles", 2018, "arXiv:1803.02900", {},
+        "10.48550/arXiv.1803.02900",
+    ),
+    "relative_braking": Work(
+        "quaglietta_multi_state_2020", "article", ("Egidio Quaglietta", "Meng Wang", "Rob M. P. Goverde"),
+        "A multi-state train-following model for the analysis of virtual coupling railway operations", 2020,
+        "Journal of Rail Transport Planning & Management", {"volume": "15", "pages": "100195"}, "10.1016/j.jrtpm.2020.100195",
+    ),
+    "sliding_mode": Work(
+        "swaroop_string_1996", "article", ("D. Swaroop", "J. K. Hedrick"),
+        "String stability of interconnected systems", 1996, "IEEE Transactions on Automatic Control",
+        {"volume": "41", "number": "3", "pages": "349-357"},
+    ),
+    "model_predictive": Work(
+        "liu_distributed_2022", "article", ("Yafei Liu", "Ronghui Liu", "Chongfeng Wei", "Jing Xun", "Tao Tang"),
+        "Distributed Model Predictive Control Strategy for Constrained High-Speed Virtually Coupled Train Set", 2022,
+        "IEEE Transactions on Vehicular Technology", {"volume": "71", "number": "1", "pages": "171-183"},
+    ),
+}  # fmt: skip
+
 #: Papers of observers that are not of the law's own paper: name of the observer -> the paper.
 OBSERVER_PAPERS = {
     "intermediate": Work(
@@ -112,8 +136,8 @@ def works(law: str, observer: str, versions: Mapping[str, str], in_sumo: bool) -
         Whether SUMO ran, or the loop without a simulator.
     """
     found, remarks = [trainctl(versions.get("trainctl", ""))], []
-    if law in PAPERS:
-        found.append(PAPERS[law])
+    if law in PAPERS or law in STANDARDS:
+        found.append({**PAPERS, **STANDARDS}[law])
     elif law == "sumo":
         remarks.append("the trains were driven by SUMO's own models: no paper of a law")
     else:

@@ -18,9 +18,7 @@ class SampledLaw(Protocol):
 
     ``demand`` must be local: the input of a train depends on its own rows and on what the links bring it.
 
-    A law that keeps something from one control instant to the next has ``initial(params, scene)``, its state at the first one:
-    arrays and numbers in (named) tuples, one row per train. Its ``demand`` then takes that as the last argument and returns
-    ``(Demand, state)``; it must not write into what it was given. The state lies in the loop's and in every checkpoint.
+    One that keeps something from one control instant to the next is a ``RememberingLaw``.
     """
 
     CLOCK: Literal["sampled"]
@@ -37,6 +35,32 @@ class SampledLaw(Protocol):
 
     def demand(self, constants: Any, own: Trains, leader: Floats, links: Links, heard: Floats) -> Demand:
         """The law. ``heard`` (L, w) is what each link brought last; rows with ``links.heard`` False are stale."""
+
+
+class RememberingLaw(Protocol):
+    """A sampled law that keeps a state from one control instant to the next: otherwise like ``SampledLaw``.
+
+    The state is arrays and numbers in (named) tuples, one row per train. It lies in the loop's and in every checkpoint, and must
+    not be written into.
+    """
+
+    CLOCK: Literal["sampled"]
+    Params: Any
+
+    def violations(self, params: Any, scene: Scene) -> list[str]:
+        """As in ``SampledLaw``."""
+
+    def constants(self, params: Any, scene: Scene) -> Any:
+        """As in ``SampledLaw``."""
+
+    def initial(self, params: Any, scene: Scene) -> Any:
+        """The state at the first instant."""
+
+    def message(self, constants: Any, own: Trains, leader: Floats, state: Any) -> Floats:
+        """As in ``SampledLaw``; the state is that of the instant before."""
+
+    def demand(self, constants: Any, own: Trains, leader: Floats, links: Links, heard: Floats, state: Any) -> tuple[Demand, Any]:
+        """As in ``SampledLaw``, with the state for the next instant."""
 
 
 class ContinuousLaw(Protocol):

@@ -15,8 +15,8 @@ from trainctl.errors import LawError
 from trainctl.numeric import lay_out
 from trainctl.plants import disturbance
 from trainctl.railway.ways import under
+from trainctl.scenario.events import Event
 from trainctl.scenario.model import Model
-from trainctl.scenario.tables import Event
 from trainctl.signals import POSITION, SPEED, Bools, Demand, Disturbed, Floats, Formed, Ints, Messages, Motion, Seen, Start
 from trainctl.stages import control, driver, orders, plant, protect, record, rerouters, topology, traffic
 from trainctl.steps import Steps
@@ -123,6 +123,7 @@ class Loop(Steps):
         self._climb(own, formed, ways, here)
         speed, acceleration = own[leading, SPEED], self.plant.acceleration(own)
         driven, formed = self.driver.step(speed, acceleration, around, going, formed, s.commanded)
+        driven = driven._replace(ordered=np.fmin(driven.ordered, self.orders.braking(speed, ordered)))  # whoever brakes hardest
 
         # protect, plant: the supervisor tries the step without what disturbs it; the plant then takes it with
         past, units = self.plant.taken(units) if self.record.due(s.k) else (None, units)
@@ -132,7 +133,9 @@ class Loop(Steps):
         def over_the_step(ordered: Floats, disturbed: Disturbed, state: plant.State, calm: bool) -> plant.Moved:
             moved = self.plant.step(s.k, t, own, demand, ordered, formed, messages, state, disturbed, calm)
             # Whoever is ordered not to start is held by its brakes, whatever pushes it.
-            return moved if around.view is None else self._held(moved, own, stands | (speed <= 0.0) & (ordered <= 0.0), here)
+            if around.view is None and not self.p.braked:
+                return moved
+            return self._held(moved, own, stands | (speed <= 0.0) & (ordered <= 0.0), here)
 
         moved, acts = self.protect.step(
             t, around.view, own, acceleration, self.plant.swing(own), driven, stands, acting, units, s.watch.acting, over_the_step

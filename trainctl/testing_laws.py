@@ -15,7 +15,8 @@ import numpy as np
 from trainctl.plants import point
 from trainctl.signals import Bounds, Consists, Demand, Floats, Links, Reference, Scene, Trains
 
-SLOT = np.array([0.0, -5000.0, -10000.0, -15000.0, -20000.0, -25000.0])
+SPACING = 5000.0
+SLOT = -SPACING * np.arange(6.0)
 EDGES = [(0, 1), (1, 2), (2, 3), (3, 4), (0, 2)]  # the last train hears nobody
 LEADER = np.array([30000.0, 80.0, 0.0, 0.0])
 DAVIS = (1.176e-2, 7.7616e-4, 1.6e-5)
@@ -62,7 +63,7 @@ def check_violations_are_lines_of_text(x: Example) -> None:
 def check_shapes_and_types(x: Example) -> None:
     """Messages (n, w), demands (n,)."""
     own = disturbed()
-    sent = x.law.message(x.law.constants(x.params, scene(x, own)), trains(own), LEADER)
+    sent = said(x, x.law.constants(x.params, scene(x, own)), own)
     assert sent.ndim == 2
     assert len(sent) == N
     assert sent.dtype == np.float64
@@ -103,9 +104,11 @@ def check_repeatable_and_inputs_untouched(x: Example) -> None:
 def check_local(x: Example) -> None:
     """A stranger's state leaves the demand bit-identical.
 
-    With the messages frozen no other train's state matters at all; with live ones only the neighbours' does.
+    With the messages frozen no other train's state matters at all; with live ones only the neighbours' does, and only that of the
+    nearest one ahead under a law that says ``FOLLOWS``.
     """
     own, hearing = disturbed(), links(x)
+    listens = hearing.desired == SPACING if getattr(x.law, "FOLLOWS", False) else np.ones(len(hearing.sender), bool)
     constants = x.law.constants(x.params, scene(x, own))
     sent = heard(x, constants, own, hearing)
     before = demand(x, own)
@@ -115,7 +118,7 @@ def check_local(x: Example) -> None:
         frozen = asked(x, constants, trains(moved), LEADER, hearing, sent)
         live = asked(x, constants, trains(moved), LEADER, hearing, heard(x, constants, moved, hearing))
         strangers = np.arange(N) != other
-        neighbours = np.isin(np.arange(N), hearing.receiver[hearing.sender == other])
+        neighbours = np.isin(np.arange(N), hearing.receiver[listens & (hearing.sender == other)])
         for after, same in ((frozen, strangers), (live, strangers & ~neighbours)):
             np.testing.assert_array_equal(after.acceleration[same], before.acceleration[same])
             np.testing.assert_array_equal(after.saturated[same], before.saturated[same])
@@ -214,7 +217,18 @@ def disturbed(seed: int = 0) -> Floats:
 
 def heard(x: Example, constants: Any, own: Floats, hearing: Links) -> Floats:
     """What the links bring if all messages arrive, shape (L, w)."""
-    return np.ascontiguousarray(x.law.message(constants, trains(own), LEADER)[hearing.sender])
+    return np.ascontiguousarray(said(x, constants, own)[hearing.sender])
+
+
+def said(x: Example, constants: Any, own: Floats) -> Floats:
+    """What every train sends, shape (n, w)."""
+    sent: Floats = x.law.message(constants, trains(own), LEADER, *first_state(x, own))
+    return sent
+
+
+def first_state(x: Example, own: Floats) -> list[Any]:
+    """The state of a law that keeps one, at its first instant; none of others."""
+    return [x.law.initial(x.params, scene(x, own))] if hasattr(x.law, "initial") else []
 
 
 def demand(x: Example, own: Floats) -> Demand:
@@ -226,9 +240,7 @@ def demand(x: Example, own: Floats) -> Demand:
 
 def asked(x: Example, constants: Any, own: Trains, leader: Floats, hearing: Links, sent: Floats) -> Demand:
     """What the law asks for; one that keeps a state of its own, at its first instant."""
-    state = []
-    if hasattr(x.law, "initial"):
-        state = [x.law.initial(x.params, scene(x, np.column_stack((own.position, own.speed))))]
+    state = first_state(x, np.column_stack((own.position, own.speed)))
     found = x.law.demand(constants, own, leader, hearing, sent, *state)
     demanded: Demand = found[0] if state else found
     return demanded
@@ -238,10 +250,10 @@ def run(x: Example, own: Floats, periods: int) -> Floats:
     """State of the point plant, shape (n, 2), after so many periods of 1 s."""
     sc = scene(x, own)
     constants, plant = x.law.constants(x.params, sc), point.constants(point.Params(), sc.consists)
-    state = [x.law.initial(x.params, sc)] if hasattr(x.law, "initial") else []
+    state = first_state(x, own)
     for k in range(periods):
         leader = np.array([LEADER[0] + LEADER[1] * k, LEADER[1], 0.0, 0.0])
-        sent = x.law.message(constants, trains(own), leader)[sc.links.sender]
+        sent = x.law.message(constants, trains(own), leader, *state)[sc.links.sender]
         found = x.law.demand(constants, trains(own), leader, sc.links, sent, *state)
         if state:
             found, *state = found

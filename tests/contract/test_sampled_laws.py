@@ -1,7 +1,7 @@
 """Every law that is evaluated once per control period keeps the same contract, whoever wrote it.
 
-A module in ``trainctl.controllers`` with ``CLOCK = "sampled"`` is found by itself; one that has required keys or weights its links
-adds them to ``EXAMPLES``. The checks themselves are ``trainctl.testing_laws``, so that authors elsewhere can run them too.
+A module in ``trainctl.controllers`` with ``CLOCK = "sampled"`` is found by itself, with every row it has in comparisons; one that
+weights its links adds that to ``WEIGHTS``. The checks themselves are ``trainctl.testing_laws``, so that authors elsewhere can run them too.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import pytest
 from trainctl import controllers
 from trainctl.testing_laws import CHECKS, Example, check_sampled_law
 
-#: Keys of [controller] and the weight of all links, where they are not none and 1.
-EXAMPLES: dict[str, tuple[dict[str, Any], float]] = {"robust_constrained": ({"h_per_s": 0.3}, 0.01)}
+#: The weight of all links, where it is not 1.
+WEIGHTS = {"robust_constrained": 0.01}
 
 
 def sampled() -> list[str]:
@@ -32,14 +32,19 @@ def law(name: str) -> Any:
 
 
 def test_there_are_sampled_laws() -> None:
-    assert {"fully_distributed", "robust_constrained"} <= set(sampled())
+    assert {"fully_distributed", "robust_constrained", "time_headway"} <= set(sampled())
+
+
+def rows() -> dict[str, tuple[str, dict[str, Any]]]:
+    """Rows of comparisons -> law and keys of [controller]."""
+    return {row: (name, keys) for name in sampled() for row, keys in law(name).COMPARED.items()}
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__.removeprefix("check_"))
-@pytest.mark.parametrize("name", sampled())
-def test_contract(name: str, check: Any) -> None:
-    keys, weight = EXAMPLES.get(name, ({}, 1.0))
-    check(Example(law(name), law(name).Params.model_validate(keys), weight))
+@pytest.mark.parametrize("row", rows())
+def test_contract(row: str, check: Any) -> None:
+    name, keys = rows()[row]
+    check(Example(law(name), law(name).Params.model_validate(keys), WEIGHTS.get(name, 1.0)))
 
 
 def spoilt(**parts: Any) -> Any:

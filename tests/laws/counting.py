@@ -40,7 +40,7 @@ def initial(params: Params, scene: Scene) -> State:
     return State(0, np.zeros(len(scene.trains)))
 
 
-def message(constants: Params, own: Trains, leader: Floats) -> Floats:
+def message(constants: Params, own: Trains, leader: Floats, state: State) -> Floats:
     """Nothing to say, shape (n, 1)."""
     return np.zeros((len(own.speed), 1))
 

@@ -22,11 +22,12 @@ def cff():
 
 
 def test_every_law_of_a_paper_has_one():
-    assert set(citation.PAPERS) == {law for law in laws() if law != "sumo"}
+    assert {*citation.PAPERS, *citation.STANDARDS} == {law for law in laws() if law != "sumo"}
+    assert not set(citation.PAPERS) & set(citation.STANDARDS)
 
 
 def test_the_file_for_citation_names_the_same(cff):
-    works = [*citation.PAPERS.values(), *citation.OBSERVER_PAPERS.values(), citation.SUMO]
+    works = [*citation.PAPERS.values(), *citation.STANDARDS.values(), *citation.OBSERVER_PAPERS.values(), citation.SUMO]
     assert [r["title"] for r in cff["references"]] == [w.title for w in works]
     for reference, work in zip(cff["references"], works, strict=True):
         authors = [" ".join(filter(None, (a.get("given-names"), a["family-names"]))) for a in reference["authors"]]
@@ -55,7 +56,13 @@ def test_an_ampersand_does_not_part_columns_in_latex():
 
 
 def test_entries_have_what_their_kind_needs():
-    for work in [*citation.PAPERS.values(), *citation.OBSERVER_PAPERS.values(), citation.SUMO, citation.trainctl("1.2")]:
+    for work in [
+        *citation.PAPERS.values(),
+        *citation.STANDARDS.values(),
+        *citation.OBSERVER_PAPERS.values(),
+        citation.SUMO,
+        citation.trainctl("1.2"),
+    ]:
         (fields,) = entries(work.bibtex()).values()
         needed = {
             "article": "journal",

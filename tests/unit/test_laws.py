@@ -42,8 +42,8 @@ def test_a_law_names_the_plants_it_runs_on():
 def test_rows_of_a_comparison_are_those_the_laws_name():
     rows = compared()
     assert list(rows) == [
-        "fully_distributed", "robust_constrained", "emu_finite_time", "ordinary_consensus", "fault_tolerant", "sumo_fixed_block",
-        "sumo_moving_block",
+        "fully_distributed", "model_predictive", "relative_braking", "robust_constrained", "sliding_mode", "time_headway",
+        "time_headway_cooperative", "emu_finite_time", "ordinary_consensus", "fault_tolerant", "sumo_fixed_block", "sumo_moving_block",
     ]  # fmt: skip
     assert rows["ordinary_consensus"] is emu_finite_time and rows["sumo_fixed_block"] is sumo
     assert shipped("powers") is None and shipped("no such law") is None and shipped("sumo") is sumo

@@ -68,7 +68,7 @@ def compare(
         int | None, typer.Option(min=1, help="Runs at a time; default one per core.", rich_help_panel=CAPACITY)
     ] = None,
 ) -> None:
-    """Compare runs: one table, figures side by side.
+    """Compare runs: one table, also in LaTeX, and figures with all of them in one axis.
 
     `trainctl compare capacity` runs the same trains on the same line under SUMO's fixed block and moving block and under every law:
     headway, trains per hour, journey time, energy, collisions.
@@ -108,8 +108,10 @@ def compare(
         runs, labels, left_out = _under_all(names[0], out, backend, settings)
     rows = comparing.table(runs)
     figures = comparing.figures(runs, labels, out, wanted)
+    tex = out / "compare.tex"
+    tex.write_text(comparing.latex(rows, labels), encoding="utf-8")
     if as_json:
-        show_json({"runs": labels, "rows": rows, "left_out": left_out, "figures": figures})
+        show_json({"runs": labels, "rows": rows, "left_out": left_out, "figures": figures, "latex": tex})
         return
     table = listing(None, "metric", *(label.replace("_", " ") for label in labels), "unit")
     for row in rows:
@@ -118,7 +120,7 @@ def compare(
     for name, reasons in left_out.items():
         for reason in reasons:
             say(f"{name} is left out: {reason}")
-    for path in figures:
+    for path in [*figures, tex]:
         say(path)
 
 

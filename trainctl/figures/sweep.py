@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from trainctl.figures import style
+from trainctl.figures.heat import heat, two_settings
 from trainctl.signals import Bools
 
 if TYPE_CHECKING:
@@ -52,10 +53,11 @@ def _crosses(panel: Axes, at: Any) -> None:
 
 
 def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
-    """Draw the complete runs over the first setting that is a number and varies, or else in order of size; violated bounds in red.
+    """Draw the complete runs over the setting that is a number and varies, or else in order of size; violated bounds in red.
 
-    Runs that gave nothing are counted in the title: what they would have shown may differ from the rest. Runs with links that did
-    not settle are crosses above the times of the others, and counted.
+    Over two such settings there are maps, see ``figures.heat``; of more the first counts. Runs that gave nothing are counted in the
+    title: what they would have shown may differ from the rest. Runs with links that did not settle are crosses above the times of
+    the others, and counted.
 
     Parameters
     ----------
@@ -73,6 +75,12 @@ def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
     shown = [key for key in SHOWN if key in done.columns and np.isfinite(done[key].to_numpy(float)).any()]
     if unsettled.any() and SETTLING not in shown:
         shown = [key for key in SHOWN if key in (*shown, SETTLING)]
+    title = runs if len(missing) else f"all {len(frame)} runs"
+    if len(done) and (both := two_settings(done, parameters)):
+        with style.styled():
+            figure = heat(frame, done, both, {key: SHOWN[key] for key in shown}, {SETTLING: unsettled}, title)
+            style.save(figure, path.with_suffix(""), (path.suffix[1:],))
+        return
     axis = next((k for k in parameters if k != "run.seed" and done[k].dtype.kind in "if" and done[k].nunique() > 1), None)
     violated = done["violations"].to_numpy(float) > 0
     with style.styled():
@@ -99,7 +107,7 @@ def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
             if key.startswith("bounds."):
                 panel.axhline(0.0, color="black", linestyle="--", linewidth=0.6)
             panel.set_ylabel(SHOWN[key])
-        axes[0].set_title(runs if len(missing) else f"all {len(frame)} runs", loc="left")
+        axes[0].set_title(title, loc="left")
         axes[-1].set_xlabel("runs in order of size" if axis is None else axis)
         figure.align_ylabels(axes)
         style.legend(figure, "double")

@@ -7,11 +7,15 @@ from typing import Any, NamedTuple
 import matplotlib.patheffects as effects
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from trainctl.figures import style
 from trainctl.figures.corridors import Corridor, corridors, crossovers
+from trainctl.figures.occupied import Occupied, along, occupied
 from trainctl.figures.trains import Drawn, in_and_out, in_formation, mark_events
 from trainctl.signals import Floats, leader_over
 
@@ -19,7 +23,7 @@ from trainctl.signals import Floats, leader_over
 MARKS = {
     "couple": ("^", "couples"), "uncouple": ("v", "uncouples"), "stop_reached": ("s", "stops"),
     "conflict": ("D", "waits for its turn"), "reroute": ("o", "new route"), "reroute_refused": ("x", "route refused"),
-    "supervisor": ("|", "supervisor acts"),
+    "supervisor": ("|", "supervisor acts"), "brake": ("<", "ordered to brake"),
 }  # fmt: skip
 #: Trains of one panel whose numbers stand on their lines, at most.
 NUMBERED = 30
@@ -36,6 +40,9 @@ def train_graph(drawn: Drawn) -> Figure:
     can be told from each other, and of many trains how far each has gained on it since the start. Where trains come and go: one
     panel per corridor, full lines for trains in formations, planned
     times dashed, and marks on the lines that say what happened.
+
+    Of not too many trains their shades are what they occupy: blocks between signals under fixed block, else body and braking
+    distance.
     """
     return _coming_and_going(drawn) if drawn.known.traffic else _on_tracks(drawn)
 
@@ -59,8 +66,14 @@ def _on_tracks(drawn: Drawn) -> Figure:
     time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
     relative, crowd = to_reference(drawn)
     bundle = crowd or (reference is not None and np.ptp(relative) < BUNDLE * np.ptp(position))
-    heights = {} if reference is None else {"height_ratios": [1, 2] if bundle else [1, 1]}
-    figure, axes = style.panels(1 if reference is None else 2, drawn.width, 60.0, **heights)
+    held = occupied(drawn) if len(drawn.trains.names) <= NUMBERED else Occupied()
+    ratio = [2, 1] if held.blocks else [1, 2] if bundle else [1, 1]
+    figure, axes = style.panels(
+        1 if reference is None else 2, drawn.width, 60.0, **({} if reference is None else {"height_ratios": ratio})
+    )
+    ways = {name: position[rows] for name, rows in drawn.trains.slices()}
+    shown = ways if held.blocks else {name: relative[rows] for name, rows in drawn.trains.slices()}
+    shades = _occupy(axes[0 if held.blocks else -1], held, shown, ways, drawn)
     track = drawn.trains.frame["track"].astype(str).to_numpy()
     tracks, switched = sorted(set(track), key=lambda name: (len(name), name)), False
     for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
@@ -85,6 +98,8 @@ def _on_tracks(drawn: Drawn) -> Figure:
     style.time_axis(axes, drawn.instants[0], drawn.instants[-1], drawn.clock)
     mark_events(axes, drawn)
     style.name_places(axes[0], [(p.at_m / 1000, p.name, p.kind) for p in crossovers(drawn.run, drawn.trains)])
+    if held.blocks:
+        _number(axes[0], {name: (time[rows], position[rows] / 1000) for name, rows in drawn.trains.slices()}, drawn)
     if not crowd:
         _number(axes[-1], {name: (time[rows], relative[rows] / 1000) for name, rows in drawn.trains.slices()}, drawn)
     else:
@@ -95,7 +110,7 @@ def _on_tracks(drawn: Drawn) -> Figure:
     ]
     if switched:
         styles.append(Line2D([], [], color=style.GREY, linestyle="none", marker="o", markersize=4, label="changes track"))
-    style.legend(figure, drawn.width, styles)
+    style.legend(figure, drawn.width, [*styles, *shades])
     return figure
 
 
@@ -106,7 +121,10 @@ def _coming_and_going(drawn: Drawn) -> Figure:
     time, inside = drawn.trains.column("time_s"), in_formation(drawn)
     rows_of = dict(drawn.trains.slices())
     planned = False
+    shades: dict[Any, Patch] = {}
+    held = occupied(drawn) if max(len(corridor.distance) for corridor in found) <= NUMBERED else Occupied()
     for panel, corridor in zip(axes, found, strict=True):
+        shades |= {shade.get_label(): shade for shade in _occupy(panel, held, corridor.distance, corridor.distance, drawn)}
         for name, distance in corridor.distance.items():
             rows = rows_of[name]
             in_and_out(panel, time[rows], distance / 1000, inside[rows], drawn.colour[name], f"_{name}")
@@ -124,8 +142,42 @@ def _coming_and_going(drawn: Drawn) -> Figure:
     if planned:
         common.append(Line2D([], [], color=style.GREY, linestyle=(0, (4, 2)), marker="o", markerfacecolor="white", markersize=3.5,
                              linewidth=0.8, label="planned"))  # fmt: skip
-    style.legend(figure, drawn.width, [*common, *marks])
+    style.legend(figure, drawn.width, [*common, *shades.values(), *marks])
     return figure
+
+
+def _occupy(
+    panel: Axes, held: Occupied, distance: dict[str, Floats], ways: dict[str, Floats], drawn: Drawn
+) -> list[Patch]:  # fmt: skip
+    """Shade what the trains of a panel occupy; entries of the legend.
+
+    Fronts are drawn at ``distance`` [m], NaN where they are elsewhere, and run as they do on their ``ways`` [m].
+    """
+    if not (held.blocks or held.length):
+        return []
+    time, rows_of = drawn.trains.column("time_s"), dict(drawn.trains.slices())
+    for name, front in distance.items():
+        colour = drawn.colour[name]
+        if held.blocks:
+            corners = [
+                [(b.begin_s, b.from_m / 1000), (b.end_s, b.from_m / 1000), (b.end_s, b.to_m / 1000), (b.begin_s, b.to_m / 1000)]
+                for b in held.blocks[name].on(front)
+            ] if name in held.blocks else []  # fmt: skip
+            panel.add_collection(PolyCollection(
+                corners, facecolors=[(*to_rgb(colour), 0.16)], edgecolors=[(*to_rgb(colour), 0.7)], linewidths=0.4, zorder=1,
+                gid=f"blocks {name}",
+            ))  # fmt: skip
+            continue
+        x, sign = time[rows_of[name]], along(ways[name])
+        rear, stand = front - sign * held.length[name], front + sign * held.braking[name]
+        for low, high, alpha, what in ((front, stand, 0.16, "braking"), (rear, front, 0.55, "body")):
+            panel.fill_between(x, low / 1000, high / 1000, color=colour, alpha=alpha, linewidth=0, zorder=1, gid=f"{what} {name}")
+    if held.blocks:
+        return [Patch(facecolor=style.GREY, edgecolor=style.GREY, alpha=0.4, label="block held")]
+    found = [Patch(facecolor=style.GREY, alpha=0.7, label="train")] if any(held.length.values()) else []
+    if held.rates:
+        found.append(Patch(facecolor=style.GREY, alpha=0.3, label=f"braking distance at {held.rate} m/s$^2$"))
+    return found
 
 
 def _marks(axes: list[Axes], found: list[Corridor], drawn: Drawn, kind: str) -> list[Line2D]:

@@ -18,7 +18,7 @@ from trainctl.runs.series import INSTANT, Pairs, Series, pairs, series
 from trainctl.signals import Bools, Floats, leader_over
 
 #: Events that every panel over time marks, where trains do not come and go.
-SHOWN_EVENTS = ("topology", "reroute", "join", "leave", "fault", "limit")
+SHOWN_EVENTS = ("topology", "reroute", "join", "leave", "fault", "limit", "brake", "brake_released")
 #: More times than this are marked, but not named.
 NAMED_EVENTS = 6
 

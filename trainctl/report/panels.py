@@ -15,6 +15,7 @@ import numpy as np
 
 from trainctl.figures import style
 from trainctl.figures.corridors import Corridor, Place, corridors, crossovers
+from trainctl.figures.occupied import Occupied, along, occupied
 from trainctl.figures.train_graph import NUMBERED, numbered_at, plans, to_reference
 from trainctl.figures.trains import Drawn, in_formation
 from trainctl.metrics.driving import JOULES_PER_KWH
@@ -29,6 +30,8 @@ Trace = dict[str, Any]
 POINTS_PER_PANEL = 30_000
 #: Points of one line: at most, and at least however many lines there are.
 POINTS = (2000, 120)
+#: Points of an edge of a shade at most.
+SHADED = 300
 #: Dashes of the library per track, by name, as ``style.TRACK_STYLES``.
 DASHES = ("solid", "8px,3px", "2px,3px", "8px,3px,2px,3px")
 #: More different bounds than this in one panel are not drawn.
@@ -111,12 +114,17 @@ def _train_graph(drawn: Drawn) -> Iterator[Panel]:
     reference = drawn.known.reference
     kinds = [("graph", "Train graph", "position [km]")]
     relative, crowd = to_reference(drawn)
+    held = _not_of_a_crowd(drawn, len(drawn.trains.names))
     if crowd:
         kinds.append(("relative", "Gained on the reference since the start", "gained [km]"))
     elif reference is not None:
         kinds.append(("relative", "Position relative to the reference", "x - x_r [km]"))
     for name, title, unit in kinds:
         traces: list[Trace] = []
+        shaded = (name == "graph") == bool(held.blocks or reference is None)
+        if shaded:
+            shown = {train: (position if name == "graph" else relative)[rows] for train, rows in drawn.trains.slices()}
+            traces += _shades(drawn, held, shown, {train: position[rows] for train, rows in drawn.trains.slices()})
         for train, rows in drawn.trains.slices():
             value = (position if name == "graph" else relative)[rows] / 1000
             for k, place in enumerate(tracks):
@@ -132,6 +140,7 @@ def _train_graph(drawn: Drawn) -> Iterator[Panel]:
         if reference is not None and name == "graph":
             traces.append(_reference(drawn, leader_over(reference, drawn.instants)[0] / 1000))
         note = "One colour per train, one dash per track." if name == "graph" else ""
+        note = f"{note} {held.words}".strip() if shaded else note
         here = _places(crossovers(drawn.run, drawn.trains)) if name == "graph" else []
         yield panel(name, title, unit, traces, note=note, places=here)
 
@@ -139,7 +148,9 @@ def _train_graph(drawn: Drawn) -> Iterator[Panel]:
 def _corridors(drawn: Drawn) -> Iterator[Panel]:
     """One train graph per corridor, with its places by name, train numbers and planned times."""
     time, rows_of = drawn.trains.column("time_s"), dict(drawn.trains.slices())
-    for number, corridor in enumerate(corridors(drawn.run, drawn.trains)):
+    found = corridors(drawn.run, drawn.trains)
+    held = _not_of_a_crowd(drawn, max(len(corridor.distance) for corridor in found))
+    for number, corridor in enumerate(found):
         value = np.full(len(time), np.nan)
         numbers: list[Trace] = []
         for k, (name, distance) in enumerate(corridor.distance.items()):
@@ -149,10 +160,37 @@ def _corridors(drawn: Drawn) -> Iterator[Panel]:
                 "x": [float(time[rows_of[name]][at])], "y": [float(distance[at]) / 1000], "text": [name], "name": name,
                 "color": _colour(drawn, name), "words": True, "group": name,
             })  # fmt: skip
-        traces = [*_in_and_out(drawn, value), *(numbers if len(numbers) <= NUMBERED else []), *_plans(drawn, corridor)]
+        shades = _shades(drawn, held, corridor.distance, corridor.distance)
+        traces = [*shades, *_in_and_out(drawn, value), *(numbers if len(numbers) <= NUMBERED else []), *_plans(drawn, corridor)]
         title = f"Train graph, {corridor.name}" if corridor.name else "Train graph"
-        note = f"{IN_AND_OUT} Rings are planned times." if any("rings" in trace for trace in traces) else IN_AND_OUT
+        planned = "Rings are planned times." if any("rings" in trace for trace in traces) else ""
+        note = " ".join(words for words in (IN_AND_OUT, planned, held.words) if words)
         yield panel(f"graph{number or ''}", title, "distance [km]", traces, note=note, places=_places(corridor.places))
+
+
+def _not_of_a_crowd(drawn: Drawn, lines: int) -> Occupied:
+    """What the trains of a run occupy, where they are not too many to be told apart."""
+    return occupied(drawn) if lines <= NUMBERED else Occupied()
+
+
+def _shades(drawn: Drawn, held: Occupied, distance: dict[str, Floats], ways: dict[str, Floats]) -> Iterator[Trace]:
+    """Blocks that trains hold, or their bodies and braking distances, as in the figures: bands behind the lines."""
+    time, rows_of = drawn.trains.column("time_s"), dict(drawn.trains.slices())
+    for name, front in distance.items():
+        band: Trace = {"color": _colour(drawn, name), "group": name, "band": True}
+        if held.blocks:
+            found = held.blocks[name].on(front) if name in held.blocks else []
+            x = [t for b in found for t in (b.begin_s, b.end_s, b.end_s, b.begin_s, b.begin_s, np.nan)]
+            y = [at / 1000 for b in found for at in (b.from_m, b.from_m, b.to_m, b.to_m, b.from_m, np.nan)]
+            if found:
+                yield {**band, "x": packed(np.array(x)), "y": packed(np.array(y)), "name": f"blocks, train {name}", "fill": "self"}
+        elif held.length:
+            some = np.flatnonzero(np.isfinite(front))
+            some = some[:: -(-len(some) // SHADED)]
+            at, sign = packed(time[rows_of[name]][some]), along(ways[name])[some]
+            rear, stand = front[some] - sign * held.length[name], front[some] + sign * held.braking[name][some]
+            yield {**band, "x": at, "y": packed(rear / 1000), "name": f"rear, train {name}"}
+            yield {**band, "x": at, "y": packed(stand / 1000), "name": f"braking distance, train {name}", "fill": True}
 
 
 def _plans(drawn: Drawn, corridor: Corridor) -> Iterator[Trace]:

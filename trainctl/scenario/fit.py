@@ -40,6 +40,11 @@ def fits(p: Model) -> list[str]:
     if p.self_driven:
         return found + list(p.law.unfit(p.scenario))
     found += [*_messages_fit(p), *_disturbances_fit(p)]
+    horizon = p.law.horizon_s(p.params, p.first_scene) if hasattr(p.law, "horizon_s") else 0.0
+    if horizon > (lasts := p.scenario.run.duration_s):
+        found.append(
+            f"controller.horizon = {p.params.horizon}: looks {horizon:g} s ahead, and the run lasts run.duration_s = {lasts:g}"
+        )
     if p.sampled:
         minimum, maximum = room(p.scenario.bounds_of_trains(), p.plant, p.consists)
         for i, t in enumerate(p.scenario.train):

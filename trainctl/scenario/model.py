@@ -77,7 +77,12 @@ class Model:
     @property
     def rerouted(self) -> bool:
         """Whether trains may be given other routes than they begin with."""
-        return bool(self.scenario.event or self.roster.closings)
+        return any(event.kind == "reroute" for event in self.scenario.event) or bool(self.roster.closings)
+
+    @property
+    def braked(self) -> bool:
+        """Whether trains may be ordered to brake."""
+        return any(event.kind == "brake" for event in self.scenario.event)
 
     @property
     def placed(self) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 
-from trainctl.scenario.tables import Order
+from trainctl.scenario.events import Order
 
 
 def mistakes(orders: Sequence[Order], routes: Mapping[str, Sequence[str]], twin: Mapping[str, str]) -> list[str]:

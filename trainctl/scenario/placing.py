@@ -11,8 +11,9 @@ import numpy as np
 from sumo_net import Line
 from trainctl.errors import InputError
 from trainctl.plants import shared
+from trainctl.scenario.events import Event
 from trainctl.scenario.reference import Profile
-from trainctl.scenario.tables import Event, Scenario
+from trainctl.scenario.tables import Scenario
 from trainctl.signals import GRAVITY, Consists, Ints
 from trainctl.topology import graph
 
@@ -161,7 +162,7 @@ def on_the_line(scenario: Scenario, line: Line) -> list[str]:
     where = {t.id: (t.track, t.position_m, t) for t in scenario.train}
     for k, event in sorted(enumerate(scenario.event, 1), key=lambda e: e[1].time_s):
         track, at_least, t = where[event.train]
-        if track in line.track_ids:
+        if event.kind == "reroute" and track in line.track_ids:
             where[event.train] = (*_reroute(f"event[{k}]", event, scenario, line, track, at_least, found), t)
     return found
 

@@ -6,33 +6,25 @@ import hashlib
 import math
 from collections import Counter
 from functools import cached_property
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, ConfigDict, Field, field_validator, model_validator
+from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from trainctl.laws import moves_points
 from trainctl.plants.disturbance import Disturbance
 from trainctl.plants.faults import Fault
 from trainctl.railway.supervisor import Params as Supervisor
+from trainctl.scenario.events import Event, Order
+from trainctl.scenario.keys import Id, NotNegative, PerUnit, Positive
 from trainctl.scenario.reference import Profile
 from trainctl.signals import Bounds, Consists, Floats, Table
 
 SCHEMA_VERSION = 1
 
 
-def _name(value: Any) -> Any:
-    """Ids are text; a number may stand for one."""
-    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
-
-
 #: More are none: beyond, a number of steps is not exact.
 MOST_STEPS = 1e15
-
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
-Id = Annotated[str, BeforeValidator(_name, json_schema_input_type=int | str)]
-PerUnit = float | tuple[float, ...]
 
 
 class RunTable(Table):
@@ -270,47 +262,6 @@ class Train(Table):
     )
 
 
-class Event(Table):
-    """[[event]]: something that happens at a time or place."""
-
-    kind: Literal["reroute"] = Field(description="reroute: the train takes a crossover to another track and stays there.")
-    train: Id = Field(description="The train.")
-    crossover: str | None = Field(
-        None, description="Id of the crossover (see `trainctl net show`); default: the next one to to_track."
-    )
-    to_track: Id | None = Field(None, description="Track to change to, if no crossover is named.")
-    to_edge: str | None = Field(
-        None, description="Edge of the net to go to by the shortest way, from where the train goes on to its old goal if it can."
-    )
-    time_s: NotNegative = Field(
-        0.0, description="When the route is ordered at the earliest [s]; the train changes track when it gets there."
-    )
-    position_m: float | None = Field(None, description="... once its front has passed this position [m].")
-    gap_below_m: Positive | None = Field(None, description="... once its gap to the train ahead is below this [m].")
-    speed_below_mps: Positive | None = Field(None, description="... once its speed is below this [m/s].")
-
-    @model_validator(mode="after")
-    def _where(self) -> Event:
-        if sum(key is not None for key in (self.crossover, self.to_track, self.to_edge)) != 1:
-            raise ValueError("give exactly one of crossover, to_track, to_edge")
-        return self
-
-
-class Order(Table):
-    """[[order]]: in which order trains pass an edge, whoever is there first."""
-
-    edge: str = Field(description="Edge of the net; an order holds on the same track in the other direction, too.")
-    trains: tuple[Id, ...] = Field(min_length=2, description="The trains, the first one first; others may pass between them.")
-
-    @field_validator("trains")
-    @classmethod
-    def _once(cls, trains: tuple[Id, ...]) -> tuple[Id, ...]:
-        twice = sorted(i for i, count in Counter(trains).items() if count > 1)
-        if twice:
-            raise ValueError(f"{', '.join(twice)} stands more than once")
-        return trains
-
-
 class Module(Table):
     """A table whose further keys belong to the module it names."""
 
@@ -436,7 +387,7 @@ class Scenario(Table):
         if self.reference.speed_mps is None or self.reference.follow_line:
             found.append("reference: with network.sumocfg give speed_mps, the cruising speed; limits and stops are obeyed anyway")
         for k, entry in enumerate(self.event, 1):
-            if entry.to_edge is None:
+            if entry.kind == "reroute" and entry.to_edge is None:
                 found.append(f"event[{k}]: with network.sumocfg give to_edge")
         return found
 

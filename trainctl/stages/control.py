@@ -68,13 +68,13 @@ class Control:
         p, law, leading = self.p, self.p.law, own[self.p.leading]
         leader = formed.references.leader(t)
         trains = Trains(leading[:, POSITION] + disturbed.measurement, leading[:, SPEED], resistance)
-        sent = law.message(formed.constants, trains, leader)
+        if p.remembers and k == 0:
+            memory = law.initial(p.params, p.scene(own, formed.links, t))
+        sent = law.message(formed.constants, trains, leader, *((memory,) if p.remembers else ()))
         number = k // p.scenario.run.held_steps
         messages, heard = exchange.deliver(self.radio, messages, sent, trains.position, formed.links, number)
         links = formed.links._replace(heard=heard)
         if p.remembers:
-            if k == 0:
-                memory = law.initial(p.params, p.scene(own, formed.links, t))
             demand, memory = law.demand(formed.constants, trains, leader, links, messages.heard, memory)
         else:
             demand = law.demand(formed.constants, trains, leader, links, messages.heard)

@@ -1,4 +1,4 @@
-"""Reroutes: orders that wait for their time, place or condition, and the way found over the rails.
+"""Reroutes and braking: orders that wait for their time, place or condition, and the way found over the rails.
 
 A switch is locked for a train that could not stop before it any more, so an order that comes later takes the next one. What cannot
 be done is refused, with the reason, as an event; the train goes on as it was. Only where nobody supervises the trains, an order of
@@ -15,8 +15,8 @@ from sumo_net.line import LineCrossover
 from trainctl.errors import InputError
 from trainctl.railway import supervisor
 from trainctl.railway.ways import Ways
+from trainctl.scenario.events import Event
 from trainctl.scenario.model import Model
-from trainctl.scenario.tables import Event
 from trainctl.signals import Floats, Ints, Seen
 from trainctl.stages.record import Journal
 
@@ -34,6 +34,7 @@ class State(NamedTuple):
 
     pending: tuple[int, ...]  # their numbers
     given: list[dict[str, Any]]  # all that came from outside, as tables; their numbers follow those of the scenario
+    braking: tuple[int, ...] = ()  # orders to brake that act
 
 
 class Orders:
@@ -53,7 +54,7 @@ class Orders:
         if event.train not in self.p.scenario.ids:
             raise ValueError(f"train {event.train}: no such train; there are: {', '.join(self.p.scenario.ids)}")
         given = [*s.given, event.model_dump(mode="json", exclude_none=True)]
-        return State((*s.pending, len(self.p.scenario.event) + len(given)), given)
+        return s._replace(pending=(*s.pending, len(self.p.scenario.event) + len(given)), given=given)
 
     def _event(self, number: int, s: State) -> Event:
         own = self.p.scenario.event
@@ -86,8 +87,11 @@ class Orders:
         """
         found: list[tuple[int, tuple[str, ...]]] = []
         due = [number for number in s.pending if self._is_due(t, self._event(number, s), seen, speed, ahead)]
+        s = self._braking(t, s, [number for number in due if self._event(number, s).kind == "brake"])
         for number in due:
             event = self._event(number, s)
+            if event.kind == "brake":
+                continue
             i = self.p.scenario.ids.index(event.train)
             lock = float(supervisor.stopping_distance(
                 np.maximum(speed[i : i + 1], 0.0), self.p.supervision.service_mps2, self.p.scenario.run.step_s, self.theta
@@ -111,6 +115,32 @@ class Orders:
             self.journal.event(t, "reroute", train=event.train, **more)
             found.append((i, edges))
         return s._replace(pending=tuple(number for number in s.pending if number not in due)) if due else s, found
+
+    def _braking(self, t: float, s: State, due: list[int]) -> State:
+        """Orders to brake that begin, and those whose time is over."""
+        over = [number for number in s.braking if (self._event(number, s).until_s or np.inf) <= t + 1e-9]
+        for number in over:
+            self.journal.event(t, "brake_released", train=self._event(number, s).train)
+        for number in due:
+            event = self._event(number, s)
+            self.journal.event(t, "brake", train=event.train, deceleration_mps2=self._deceleration(event))
+        return s._replace(braking=tuple(number for number in (*s.braking, *due) if number not in over)) if over or due else s
+
+    def _deceleration(self, event: Event) -> float:
+        return event.deceleration_mps2 or self.p.supervision.emergency_mps2
+
+    def braking(self, speed: Floats, s: State) -> Floats:
+        """Acceleration every train is ordered to brake with (n,) [m/s2], NaN where it is not; of several orders the hardest.
+
+        Within a step it comes to a stand at most: ``speed`` (n,) [m/s] is that of every train now.
+        """
+        found = np.full(len(speed), np.nan)
+        for number in s.braking:
+            event = self._event(number, s)
+            i = self.p.scenario.ids.index(event.train)
+            found[i] = np.fmin(found[i], -self._deceleration(event))
+        ordered: Floats = np.maximum(found, -np.maximum(speed, 0.0) / self.p.scenario.run.step_s)
+        return ordered
 
     def _is_due(self, t: float, event: Event, seen: Seen, speed: Floats, ahead: Ints) -> bool:
         if event.time_s > t + 1e-9:

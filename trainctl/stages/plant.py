@@ -158,7 +158,7 @@ class Units:
         self.masses = p.consists.train_mass()
         self.lag = p.assumed.lag
         self.hilly = bool(len(self.gradient)) or bool(p.net_slope.any())
-        ordered = p.looks_ahead
+        ordered = p.looks_ahead or p.braked
         # Written anew in every step before they are read, like the columns of the plant's table that disturb it.
         self.told = shared.constants(p.plant_params, p.consists, self.gradient) if p.sampled else shared.NOBODY
         self.orders = integrate.Orders(

@@ -1,4 +1,4 @@
-"""Several runs side by side: one table, and figures with one panel per run on common axes.
+"""Several runs: one table, on the terminal and in LaTeX, and figures with all of them in one axis.
 
 ``alternatives`` puts the other laws in front of the same traffic: trains, network, events, reference, bounds and links stay, the
 law and what belongs to it (plant, observer, periods) changes.
@@ -6,23 +6,19 @@ law and what belongs to it (plant, observer, periods) changes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-
 from trainctl.errors import InputError
 from trainctl.figures import style
-from trainctl.figures.trains import Drawn, draw_inputs, draw_speeds, drawable
+from trainctl.figures.overlay import QUANTITIES, overlay
+from trainctl.figures.trains import drawable
 from trainctl.laws import compared, find_plant, plants_of
 from trainctl.metrics.run import DEFINITIONS, metrics
 from trainctl.metrics.values import Values
 from trainctl.runs.run import Run
-from trainctl.signals import leader_over
 
 #: Rows of the table, as far as they apply to any of the runs.
 ROWS = (
@@ -35,9 +31,6 @@ ROWS = (
     "energy.traction_kwh", "energy.net_kwh_per_train_km", "comfort.acceleration_max_mps2", "comfort.jerk_max_mps3",
     "comfort.jerk_rms_mps3", "traffic.gap_min_m", "traffic.headway_min_s", "traffic.trains_per_hour",
 )  # fmt: skip
-
-#: Panels per row of a figure.
-COLUMNS = 3
 
 
 def table(runs: Sequence[Run]) -> list[dict[str, Any]]:
@@ -70,65 +63,43 @@ def figures(runs: Sequence[Run], labels: Sequence[str], out: Path, formats: Sequ
         drawn = [drawable(run) for run in runs]
         if not any(one.trains.names for one in drawn):
             raise InputError("compare: no train was recorded in any of the runs")
-        for name, paint in PANELS.items():
-            figure = side_by_side(drawn, labels, paint)
-            if name == "spacing_errors":
-                for axes in figure.axes:
-                    axes.set_yscale("log")
-                    axes.set_ylim(bottom=1e-3)
-            written += style.save(figure, out / f"compare_{name}", formats)
+        origin = "; ".join(one.origin for one in drawn)
+        for what in QUANTITIES:
+            title = f"{what} of {', '.join(labels)}"
+            written += style.save(overlay(drawn, labels, what), out / f"compare_{what}", formats, title, origin)
     return written
 
 
-def side_by_side(drawn: Sequence[Drawn], labels: Sequence[str], paint: Callable[[Axes, Drawn], None]) -> Figure:
-    """One panel per run with common axes, at most three in a row."""
-    across = min(COLUMNS, len(drawn))
-    down = -(-len(drawn) // across)
-    millimetre = 1 / 25.4
-    figure = Figure(figsize=(style.WIDTHS_MM["double"] * millimetre, (down * 48.0 + 14.0) * millimetre), layout="constrained")
-    FigureCanvasAgg(figure)
-    grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
-    for k, (axes, one, label) in enumerate(zip(grid.flat, drawn, labels, strict=False)):
-        paint(axes, one)
-        axes.set_title(label.replace("_", " "), loc="left")
-        if k % across:
-            axes.set_ylabel("")
-        if k + across >= len(drawn):  # the lowest of its column
-            axes.set_xlabel("time [s]")
-            axes.tick_params(labelbottom=True)
-    for axes in list(grid.flat)[len(drawn) :]:
-        axes.remove()
-    if len({len(one.names) for one in drawn}) > 1:  # a train has not the same colour in all panels: only what all have in common
-        found = [handle for axes in figure.axes for handle in axes.get_legend_handles_labels()[0]]
-        common = {str(handle.get_label()): handle for handle in found if str(handle.get_label()) in style.COMMON}
-        style.legend(figure, "double", list(common.values()))
-    else:
-        style.legend(figure, "double")
-    return figure
+def latex(rows: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> str:
+    """The table as a ``tabular`` of booktabs, three significant digits, a dash where a metric does not apply."""
+    lines = [" & ".join(["metric", "unit", *map(_escaped, labels)]), *(
+        " & ".join([_escaped(row["metric"]), _unit(row["unit"]), *map(_number, row["values"])]) for row in rows
+    )]  # fmt: skip
+    body = " \\\\\n".join([f"{lines[0]} \\\\\n\\midrule\n{lines[1]}" if len(lines) > 1 else lines[0], *lines[2:]])
+    columns = "ll" + "r" * len(labels)
+    return f"% \\usepackage{{booktabs}}\n\\begin{{tabular}}{{{columns}}}\n\\toprule\n{body} \\\\\n\\bottomrule\n\\end{{tabular}}\n"
 
 
-def _relative(axes: Axes, drawn: Drawn) -> None:
-    time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
-    reference = drawn.known.reference
-    for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
-        at = 0.0 if reference is None else leader_over(reference, time[rows])[0]
-        style.draw(axes, time[rows], (position[rows] - at) / 1000, label=label, **drawn.look[name])
-    axes.set_ylabel("position [km]" if reference is None else r"$x_i - x_r$ [km]")
+def _escaped(text: str) -> str:
+    """Text whose signs mean nothing to TeX."""
+    signs = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    return "".join(signs.get(sign, f"\\{sign}" if sign in "&%$#_{}" else sign) for sign in text)
 
 
-def _errors(axes: Axes, drawn: Drawn) -> None:
-    links = drawn.links
-    looks = zip(links.slices(), style.colours(len(links.names)), style.labels(links.names, "link "), strict=True)
-    for (_, rows), colour, label in looks:
-        style.draw(axes, links.column("time_s")[rows], np.abs(links.column("error_m")[rows]).clip(1e-4), color=colour, label=label)
-    if not links.names:
-        axes.text(0.5, 0.5, "no links", transform=axes.transAxes, ha="center", color=style.GREY)
-    axes.set_ylabel(r"$|x_{ij} - d_{ij}|$ [m]")
+def _unit(text: str) -> str:
+    return re.sub(r"(?<=[a-z])(\d)", r"$^\1$", _escaped(text)) if text != "1" else ""
 
 
-PANELS: dict[str, Callable[[Axes, Drawn], None]] = {
-    "positions": _relative, "spacing_errors": _errors, "speeds": draw_speeds, "inputs": draw_inputs,
-}  # fmt: skip
+def _number(value: Any) -> str:
+    if value is None:
+        return "--"
+    if isinstance(value, bool | str) or not isinstance(value, int | float):
+        return _escaped(str(value))
+    value = float(f"{value:.2e}")
+    if value == 0.0 or 1e-3 <= abs(value) < 1e6:
+        return f"${value:,g}$".replace(",", r"\,")
+    mantissa, _, power = f"{value:.2e}".partition("e")
+    return f"${mantissa} \\cdot 10^{{{int(power)}}}$" if power else f"${value}$"
 
 
 # --- the other laws on the same traffic -------------------------------------------------------------------------------------------

@@ -46,3 +46,39 @@ def test_runs_that_did_not_settle_are_shown_and_counted(tmp_path: Path) -> None:
     frame["formation.settling_s"] = np.nan
     summary(frame, ["topology.loss"], tmp_path / "none.svg")
     assert "4 not settled by the end" in (tmp_path / "none.svg").read_text()
+
+
+def over_two(**more: list[float | None]) -> pd.DataFrame:
+    """Four cells with two runs each."""
+    return pd.DataFrame({
+        "run.seed": [0, 1] * 4, "topology.loss": [0.0, 0.0, 0.1, 0.1] * 2, "topology.delay_s": [0] * 4 + [5] * 4,
+        "status": "complete", "violations": [0, 0, 0, 1, 0, 0, 2, 1], MARGIN: [10.0, 20.0, 5.0, -1.0, 8.0, 8.0, -3.0, -4.0], **more,
+    })  # fmt: skip
+
+
+def drawn(frame: pd.DataFrame, path: Path) -> list[str]:
+    summary(frame, ["topology.loss", "topology.delay_s", "run.seed"], path / "summary.svg")
+    return [re.sub("\u2212", "-", text) for text in re.findall(r"<text[^>]*>([^<]*)</text>", (path / "summary.svg").read_text())]
+
+
+def test_two_settings_are_maps_with_the_median_of_every_pair(tmp_path: Path) -> None:
+    text = drawn(over_two(), tmp_path)
+    assert {"topology.loss", "topology.delay_s", "share of runs that violate a bound", "room above the lower spacing [m]"} <= set(
+        text
+    )
+    assert {"20", "5", "8", "-3"} <= set(text)  # medians
+    assert {"0", "0.5", "1"} <= set(text)  # shares
+    assert "all 8 runs; median of 2 runs per cell" in text
+
+
+def test_a_map_shows_what_did_not_settle_and_what_gave_nothing(tmp_path: Path) -> None:
+    frame = over_two(**{
+        "formation.settling_s": [300.0, 400.0, 350.0, None, None, None, 500.0, 600.0],
+        "formation.final_error_m": [0.1, 0.1, 0.1, 9.0, 9.0, 9.0, 0.1, 0.1],
+    })  # fmt: skip
+    text = drawn(frame, tmp_path)
+    assert "most runs not settled" in text and "no complete run" not in text
+    assert {"400", "600"} <= set(text) and "350" not in text  # one of two did not settle: later than the other
+    frame.loc[6:, "status"] = "failed"
+    text = drawn(frame, tmp_path)
+    assert "no complete run" in text and "6 of 8 runs complete, 2 failed; median of 2 runs per cell" in text

@@ -11,7 +11,7 @@ from staged import started
 
 from trainctl.errors import InputError
 from trainctl.scenario.build import open_scenario
-from trainctl.scenario.tables import Event
+from trainctl.scenario.events import Event
 from trainctl.stages.orders import Orders, State
 
 

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import json
+import shutil
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
 from trainctl.cli.program import app
+from trainctl.figures.overlay import QUANTITIES, overlay, scale
+from trainctl.figures.trains import drawable
 from trainctl.laws import laws
+from trainctl.runs.run import Run
 from trainctl.scenario.build import model_of
 from trainctl.scenario.reading import examine, find, read
-from trainctl.studies.compare import PANELS, alternatives, figures, names, table
+from trainctl.studies.compare import alternatives, figures, latex, names, table
 
 
 @pytest.fixture(scope="module")
@@ -34,17 +41,19 @@ def test_names_tell_folders_apart(finished, runs):
     assert len(set(names([runs[0], runs[0]]))) == 2
 
 
-def test_figures_have_a_panel_per_run_on_one_scale(runs, tmp_path):
+def test_a_figure_per_quantity(runs, tmp_path):
     written = figures(runs, ["a", "b"], tmp_path)
-    assert [path.name for path in written] == [f"compare_{name}.png" for name in PANELS]
+    assert [path.name for path in written] == [f"compare_{name}.png" for name in QUANTITIES]
     assert all(path.stat().st_size > 5000 for path in written)
 
 
 def test_every_law_can_be_put_in_front_of_three_tracks():
     data, path = read("three_tracks")
     found = alternatives(data, laws())
-    assert list(found)[:5] == ["fully_distributed", "robust_constrained", "emu_finite_time", "ordinary_consensus", "fault_tolerant"]
-    assert list(found)[5:] == ["sumo_fixed_block", "sumo_moving_block"]
+    assert list(found) == [
+        "fully_distributed", "model_predictive", "relative_braking", "robust_constrained", "sliding_mode", "time_headway",
+        "time_headway_cooperative", "emu_finite_time", "ordinary_consensus", "fault_tolerant", "sumo_fixed_block", "sumo_moving_block",
+    ]  # fmt: skip
     assert found["fully_distributed"] == data
     for name, changed in found.items():
         assert [changed[key] for key in ("train", "event", "network", "reference", "bounds", "link")] == [
@@ -79,6 +88,7 @@ def test_laws_that_cannot_drive_the_traffic_are_named_with_the_reason(tmp_path):
     assert any("SUMO drives by itself" in reason for reason in told["left_out"]["sumo_fixed_block"])
     assert (tmp_path / "fully_distributed" / "run.json").is_file()
     assert (tmp_path / "compare_speeds.png").is_file()
+    assert "fully" in (tmp_path / "compare.tex").read_text() and told["latex"] == str(tmp_path / "compare.tex")
 
 
 def test_sumos_own_trains_are_rows_of_the_comparison(tmp_path, monkeypatch):
@@ -90,3 +100,47 @@ def test_sumos_own_trains_are_rows_of_the_comparison(tmp_path, monkeypatch):
     rows = {row["metric"]: row["values"] for row in told["rows"]}
     assert rows["energy.traction_kwh"][2] > 0.0
     assert [value is None for value in rows["formation.final_error_m"]] == [False, True, True]
+
+
+def test_all_runs_stand_in_one_axis_each_in_its_colour(runs):
+    drawn = [drawable(run) for run in runs]
+    for what in QUANTITIES:
+        (axes,) = overlay(drawn, ["one", "other_one"], what).axes
+        colours = {str(line.get_label()): line.get_color() for line in axes.lines}
+        assert {"one", "other one"} <= set(colours) and colours["one"] != colours["other one"]
+        assert {"one", "other one"} <= {text.get_text() for text in axes.texts}, what
+        assert not [text for text in axes.texts if text.get_gid() == "clipped"], what
+
+
+def test_outliers_are_clipped_and_said(finished, runs, tmp_path):
+    folder = tmp_path / "wild"
+    shutil.copytree(runs[1].folder, folder)
+    trains = pq.read_table(folder / "trains.parquet")
+    value = trains["input_mps2"].to_numpy().copy()
+    value[np.flatnonzero(trains["time_s"].to_numpy() == 30.0)[1]] = -67.0
+    place = trains.column_names.index("input_mps2")
+    pq.write_table(trains.set_column(place, "input_mps2", pa.array(value)), folder / "trains.parquet")
+    (axes,) = overlay([drawable(runs[0]), drawable(Run(folder))], ["tame", "wild"], "inputs").axes
+    (said,) = [text.get_text() for text in axes.texts if text.get_gid() == "clipped"]
+    assert axes.get_ylim()[0] > -10.0
+    assert said.startswith("beyond the scale:\n") and "wild down to -67" in said
+
+
+def test_scale_follows_most_values_of_most_runs():
+    calm = np.linspace(-1.0, 1.0, 400)
+    low, high = scale([calm, calm, 1000.0 * calm])
+    assert (low, high) == pytest.approx((-1.08, 1.08), rel=0.02)
+    assert scale([calm, 3.0 * calm]) == pytest.approx((-3.36, 3.36))  # nothing of it squeezes the other
+    assert scale([calm, np.append(calm, 50.0)])[1] < 1.2
+    assert scale([np.zeros(5)]) == (0.0, 0.0)
+
+
+def test_the_table_in_latex(runs):
+    text = latex([
+        {"metric": "a_b", "unit": "m/s2", "values": [0.012345, None]}, {"metric": "c", "unit": "1", "values": [18631.0, 3.0e-9]},
+    ], ["x_1", "50 %"])  # fmt: skip
+    assert text.splitlines()[1:] == [
+        r"\begin{tabular}{llrr}", r"\toprule", r"metric & unit & x\_1 & 50 \% \\", r"\midrule",
+        r"a\_b & m/s$^2$ & $0.0123$ & -- \\", r"c &  & $18\,600$ & $3.00 \cdot 10^{-9}$ \\", r"\bottomrule", r"\end{tabular}",
+    ]  # fmt: skip
+    assert len(latex(table(runs), ["a", "b"]).splitlines()) == len(table(runs)) + 7

@@ -34,9 +34,9 @@
       if (t.words) return { type: "scatter", mode: "text", x: t.x, y: t.y, text: t.text.map((w) => `<b>${safe(w)}</b>`), textfont: { color: shown(t.color), size: 11 }, textposition: "top left", hoverinfo: "skip", visible: drawn_now(t) };
       return {
         type: "scatter", mode: t.rings ? "lines+markers" : "lines", x: t.x, y: t.y, name: t.name, connectgaps: false, opacity: t.alpha || 1, visible: drawn_now(t),
-        line: { color: shown(t.color), width: t.band ? 0 : many ? 0.8 : 1.6, dash: t.dash || "solid", shape: t.step ? "hv" : "linear" },
+        line: { color: shown(t.color), width: t.fill === "self" ? 0.5 : t.band ? 0 : many ? 0.8 : 1.6, dash: t.dash || "solid", shape: t.step ? "hv" : "linear" },
         ...(t.rings ? { marker: { symbol: "circle-open", size: 7, color: shown(t.color) } } : {}),
-        fill: t.fill ? "tonexty" : "none", fillcolor: t.fill ? faint(t.color) : undefined,
+        fill: t.fill === "self" ? "toself" : t.fill ? "tonexty" : "none", fillcolor: t.fill ? faint(t.color) : undefined,
         hoverinfo: t.band ? "skip" : undefined, hovertemplate: t.band ? undefined : "<b>%{fullData.name}</b><br>%{y:.5~g} at %{x:.6~g} s<extra></extra>",
       };
     });

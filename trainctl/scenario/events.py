@@ -1,0 +1,66 @@
+"""What happens at a time or place: ``[[event]]`` and ``[[order]]`` of a scenario."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from trainctl.scenario.keys import Id, NotNegative, Positive
+from trainctl.signals import Table
+
+
+class Event(Table):
+    """[[event]]: something that happens at a time or place."""
+
+    kind: Literal["reroute", "brake"] = Field(
+        description="reroute: the train takes a crossover to another track and stays there. brake: it brakes on its own."
+    )
+    train: Id = Field(description="The train.")
+    crossover: str | None = Field(
+        None, description="Id of the crossover (see `trainctl net show`); default: the next one to to_track."
+    )
+    to_track: Id | None = Field(None, description="Track to change to, if no crossover is named.")
+    to_edge: str | None = Field(
+        None, description="Edge of the net to go to by the shortest way, from where the train goes on to its old goal if it can."
+    )
+    deceleration_mps2: Positive | None = Field(
+        None, description="brake: so hard, as far as its plant can [m/s2]; default full braking, [supervisor] emergency_mps2."
+    )
+    until_s: Positive | None = Field(
+        None, description="brake: from then on its law drives it again [s]; default never, it stands in the end."
+    )
+    time_s: NotNegative = Field(
+        0.0, description="When it is ordered at the earliest [s]; a train that is rerouted changes track when it gets there."
+    )
+    position_m: float | None = Field(None, description="... once its front has passed this position [m].")
+    gap_below_m: Positive | None = Field(None, description="... once its gap to the train ahead is below this [m].")
+    speed_below_mps: Positive | None = Field(None, description="... once its speed is below this [m/s].")
+
+    @model_validator(mode="after")
+    def _of_its_kind(self) -> Event:
+        ways = [key for key in ("crossover", "to_track", "to_edge") if getattr(self, key) is not None]
+        brakes = [key for key in ("deceleration_mps2", "until_s") if getattr(self, key) is not None]
+        if self.kind == "reroute" and len(ways) != 1:
+            raise ValueError("give exactly one of crossover, to_track, to_edge")
+        if strange := brakes if self.kind == "reroute" else ways:
+            raise ValueError(f"{', '.join(strange)}: not with kind = {self.kind}")
+        if self.until_s is not None and self.until_s <= self.time_s:
+            raise ValueError(f"until_s = {self.until_s:g}: must be after time_s = {self.time_s:g}")
+        return self
+
+
+class Order(Table):
+    """[[order]]: in which order trains pass an edge, whoever is there first."""
+
+    edge: str = Field(description="Edge of the net; an order holds on the same track in the other direction, too.")
+    trains: tuple[Id, ...] = Field(min_length=2, description="The trains, the first one first; others may pass between them.")
+
+    @field_validator("trains")
+    @classmethod
+    def _once(cls, trains: tuple[Id, ...]) -> tuple[Id, ...]:
+        twice = sorted(i for i, count in Counter(trains).items() if count > 1)
+        if twice:
+            raise ValueError(f"{', '.join(twice)} stands more than once")
+        return trains
