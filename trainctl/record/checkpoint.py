@@ -347,7 +347,8 @@ def restore(loop: Loop, tape: Tape, saved: Saved) -> None:
         raise SimulatorError("the simulator did not come back to where it was: other versions or another network")
     values = saved.values["state"]
     going = again(f"state.{loop.state._fields.index('traffic')}", loop.state.traffic, saved.arrays, values)
-    loop.runs_round(going.leg, [], loop.state.watch)
+    if going.leg.any():
+        loop.runs_round(going.leg, [], loop.state.watch)
     # What law and plant made of the last change of topology has shapes and parts of its own: made again, then filled.
     made = again("made_of", MADE_OF, saved.arrays, values)
     scene = loop.p.scene(made[1], made[2], made[0])

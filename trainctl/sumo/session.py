@@ -378,8 +378,7 @@ class Sumo(Session):
 
     def turn(self, train: int, edges: tuple[str, ...], arrival: float) -> None:
         """Let a train turn back with the next ``move``: SUMO does as soon as the route says so, so it has not until now."""
-        here = self.line.edges[self.seen.edge[train]]
-        self._call(self.api.vehicle.setRoute, self.ids[train], [here, *normal(edges)])
+        self._call(self.api.vehicle.setRoute, self.ids[train], [self.line.edges[self.seen.edge[train]], *normal(edges)])
         self.turning.append((train, edges, arrival))
 
     def linked(self, links: Links, formation: Ints) -> None:
@@ -418,12 +417,10 @@ class Sumo(Session):
 
     def _turned(self, train: int, edges: tuple[str, ...], arrival: float) -> tuple[float, float]:
         """Take over the way of a train that has turned: where its front should be now, and how far that is from its edge's end."""
-        line, row, before = self.line, int(self.seen.row[train]), self.ways.first
-        self.ways, row, place = turned(
-            self.ways, train, row, float(self.seen.position[train]), float(self.length[train]), [line.index[e] for e in edges],
-            line.start_m, line.length_m,
-        )  # fmt: skip
-        rows = self.seen.row + self.ways.first[:-1] - before[:-1]
+        line, rows, before, onward = self.line, self.seen.row, self.ways.first, [self.line.index[e] for e in edges]
+        front, length = float(self.seen.position[train]), float(self.length[train])
+        self.ways, row, place = turned(self.ways, train, int(rows[train]), front, length, onward, line.start_m, line.length_m)
+        rows = rows + self.ways.first[:-1] - before[:-1]
         rows[train] = row
         self.seen = self.seen._replace(row=rows)
         self.arrival[train] = arrival
