@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 from xml.parsers import expat
 
+from sumo_net import bounded
 from sumo_net.spec import LineError
 
 #: Vehicle classes that make an edge a railway.
@@ -60,12 +61,13 @@ def content(path: Path) -> bytes:
         If there is no such file, or it cannot be read.
     """
     try:
-        packed = path.read_bytes()
-        return gzip.decompress(packed) if packed[:2] == b"\x1f\x8b" else packed
+        return bounded.content(path)
     except FileNotFoundError:
         raise LineError([f"{path}: no such net file"]) from None
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise LineError([f"{path}: damaged gzip: {error}"]) from None
+    except bounded.TooLong as error:
+        raise LineError([f"{path}: {error}: not a net of SUMO"]) from None
     except OSError as error:
         raise LineError([f"{path}: cannot be read: {error.strerror}"]) from None
 

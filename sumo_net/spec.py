@@ -16,6 +16,8 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
+from sumo_net.bounded import short_text
+
 #: Distance between the centres of neighbouring tracks [m].
 TRACK_SPACING_M = 4.5
 
@@ -203,7 +205,7 @@ def read_spec(path: str | Path) -> LineSpec:
     """
     path = Path(path)
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = tomllib.loads(short_text(path))
     except FileNotFoundError:
         raise LineError([f"{path}: no such file"]) from None
     except OSError as error:

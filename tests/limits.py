@@ -19,8 +19,8 @@ class Hang(BaseException):
 
 
 @contextmanager
-def bounded():
-    """Only mistakes in words may leave; processor time and memory are limited."""
+def bounded(memory=LIMIT_BYTES):
+    """Only mistakes in words may leave; processor time and memory [bytes] are limited."""
 
     def stop(*_):
         raise Hang(f"more than {LIMIT_S} s of processor time")
@@ -28,7 +28,7 @@ def bounded():
     data = next(int(line.split()[1]) << 10 for line in Path("/proc/self/status").read_text().splitlines() if "VmData" in line)
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     before = signal.signal(signal.SIGPROF, stop)
-    resource.setrlimit(resource.RLIMIT_DATA, (data + LIMIT_BYTES, hard))
+    resource.setrlimit(resource.RLIMIT_DATA, (data + memory, hard))
     signal.setitimer(signal.ITIMER_PROF, LIMIT_S)
     try:
         yield

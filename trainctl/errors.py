@@ -10,6 +10,16 @@ def printable(line: str) -> str:
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in line)
 
 
+#: Control characters but tab and newline, and those that turn the direction of writing; and how they are shown.
+STEERING = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\t\n"}
+STEERING |= {code: f"\\u{code:04x}" for code in (0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A))}
+
+
+def visible(text: str) -> str:
+    """Text as it is written: characters that steer a terminal, which titles and ids may hold, are shown as hexadecimal escapes."""
+    return text.translate(STEERING)
+
+
 class TrainctlError(Exception):
     """Base of all errors this package raises on purpose."""
 

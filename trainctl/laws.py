@@ -10,7 +10,7 @@ import pkgutil
 import re
 import sys
 import traceback
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -24,13 +24,13 @@ ENTRY_POINTS = "trainctl.controllers"
 
 def laws() -> list[str]:
     """Names of the laws that come with the package and of those other packages offer."""
-    own = [m.name for m in pkgutil.iter_modules(controllers.__path__) if hasattr(_module(controllers, m.name), "CLOCK")]
+    own = [name for name in _inside(controllers) if hasattr(_module(controllers, name), "CLOCK")]
     return sorted({*own, *(e.name for e in importlib.metadata.entry_points(group=ENTRY_POINTS))})
 
 
 def shipped(name: str) -> Any:
     """The module of a law that comes with the package, or None."""
-    if not name.isidentifier() or all(m.name != name for m in pkgutil.iter_modules(controllers.__path__)):
+    if name not in _inside(controllers):
         return None
     module = _module(controllers, name)
     return module if hasattr(module, "CLOCK") else None
@@ -38,9 +38,15 @@ def shipped(name: str) -> Any:
 
 def compared() -> dict[str, Any]:
     """Rows of a comparison -> the module of their law: the package's own, sampled ones first, SUMO's trains last."""
-    modules = [_module(controllers, m.name) for m in pkgutil.iter_modules(controllers.__path__)]
+    modules = [_module(controllers, name) for name in _inside(controllers)]
     found = [module for clock in ("sampled", "continuous", "none") for module in modules if getattr(module, "CLOCK", "") == clock]
     return {row: module for module in found for row in getattr(module, "COMPARED", ())}
+
+
+@cache
+def _inside(package: Any) -> tuple[str, ...]:
+    """Names of the modules in a package of ours: looked up once, for sweeps open thousands of scenarios."""
+    return tuple(m.name for m in pkgutil.iter_modules(package.__path__))
 
 
 def _module(package: Any, name: str) -> Any:
@@ -124,7 +130,7 @@ def _complete(name: str, load: Any) -> Any:
 
 def find_observer(name: str) -> Any:
     """The module of an observer."""
-    known = [m.name for m in pkgutil.iter_modules(observers.__path__)]
+    known = _inside(observers)
     if name not in known:
         raise InputError(f"observer.kind = {name}: no such observer; known: {', '.join(known)}")
     return _module(observers, name)
@@ -139,7 +145,7 @@ def find_plant(name: str) -> Any:
 
 
 def _plants() -> list[str]:
-    return [m.name for m in pkgutil.iter_modules(plants.__path__) if hasattr(_module(plants, m.name), "relied_on")]
+    return [name for name in _inside(plants) if hasattr(_module(plants, name), "relied_on")]
 
 
 def moves_points(name: str) -> bool:

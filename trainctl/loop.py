@@ -70,7 +70,7 @@ class Loop(Steps):
         self.rerouters = rerouters.Rerouters(p, journal)
         self.orders, self.traffic = orders.Orders(p, journal), traffic.Traffic(p, journal)
         self.topology = topology.Topology(p, journal)
-        self.control, self.driver, self.plant = control.Control(p), driver.of(p), plant.of(p)
+        self.control, self.driver, self.plant = control.Control(p, p.radio), driver.of(p), plant.of(p, p.radio)
         self.protect = protect.Protect(p, journal, bool(len(self.disturbances.whole)) or self.plant.noisy)
         rule, formed = self.topology.rule.initial()
         self.state = State(
@@ -238,7 +238,7 @@ class Loop(Steps):
             own, units = self.plant.turned(i, own, float(position[i]), units)
         formed = formed._replace(offset=offset)
         self.runs_round(going.leg, trains, watch)
-        if self.p.consists is not self.built.consists or self.p.has_units:
+        if self.p.has_units:
             assert formed.links is not None
             scene = self.p.scene(own, formed.links, t)
             constants = self.p.law.constants(self.p.params, scene)
@@ -251,7 +251,7 @@ class Loop(Steps):
         self.p = p = self.built.turned(leg % 2 == 1)
         self.record.turned(p, trains, watch)
         if p.has_units:
-            self.topology, self.plant = topology.Topology(p, self.journal), plant.of(p)
+            self.topology, self.plant = topology.Topology(p, self.journal), plant.of(p, p.radio)
 
     def _climb(self, own: Floats, formed: Formed, ways: Any, here: Seen) -> None:
         """Tell the plant the slope of the net under every unit; that of a line it knows by the kilometrage."""

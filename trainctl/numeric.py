@@ -5,10 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numba import njit
 
 from sumo_net import Line
+from trainctl.kernels import keep_by_sources
 from trainctl.railway.ways import Ways, rerouted, turned, ways
 from trainctl.signals import Floats, Ints, Links, Seen, Start
+
+keep_by_sources()  # before anything below is decorated
 
 
 def lay_out(line: Line, start: Start) -> Ways:
@@ -23,6 +27,16 @@ LEAVES_M = 0.1
 def way_lengths(ways: Ways, line: Line, arrival: Floats) -> Floats:
     """Where every train leaves, from the beginning of the last edge of its way (n,) [m]."""
     return np.minimum(arrival, line.length_m[ways.edge[ways.first[1:] - 1]])
+
+
+@njit(cache=True)
+def go_on(ways: Ways, length_m: Floats, displacement: Floats, row: Ints, lane_position: Floats) -> None:
+    """Move every train along its way: its ``row`` (n,) and how far it is on that edge [m] (n,) are overwritten."""
+    for i in range(len(row)):
+        lane_position[i] += displacement[i]
+        while row[i] < ways.first[i + 1] - 1 and lane_position[i] > length_m[ways.edge[row[i]]]:
+            lane_position[i] -= length_m[ways.edge[row[i]]]
+            row[i] += 1
 
 
 class Numeric:
@@ -70,16 +84,10 @@ class Numeric:
 
     def move(self, displacement: Floats, step: float) -> None:
         """Move every train; as in SUMO one on the very end of an edge is still on it, and one near the end of its way is gone."""
-        self.lane_position += np.where(self.present, displacement, 0.0)
+        go_on(self.ways, self.line.length_m, np.where(self.present, displacement, 0.0), self.row, self.lane_position)
         for train, edges, arrival in self.turning:
             self._turn(train, edges, arrival)
         self.turning.clear()
-        edge, length = self.ways.edge, self.line.length_m
-        for i in np.flatnonzero(self.lane_position > length[edge[self.row]]).tolist():
-            last = int(self.ways.first[i + 1]) - 1
-            while self.lane_position[i] > length[edge[self.row[i]]] and self.row[i] < last:
-                self.lane_position[i] -= length[edge[self.row[i]]]
-                self.row[i] += 1
         ends = way_lengths(self.ways, self.line, self.arrival) - LEAVES_M
         self.present &= (self.row < self.ways.first[1:] - 1) | (self.lane_position <= ends)
         self.present[self.coming] = True

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import signal
 import sys
@@ -26,6 +25,7 @@ from trainctl.metrics.run import metrics
 from trainctl.numeric import Numeric
 from trainctl.record import checkpoint
 from trainctl.record.folder import (
+    INFO,
     about_run,
     finish,
     held,
@@ -38,6 +38,8 @@ from trainctl.record.folder import (
     write_json,
     written,
 )  # fmt: skip
+from trainctl.record.recorder import EVENTS
+from trainctl.record.sums import sealed, sum_of, unsealed, verify
 from trainctl.runs.run import Run
 from trainctl.scenario import promise, roster
 from trainctl.scenario.build import model_of
@@ -144,7 +146,7 @@ def _opened(
         write_info(partial, info)
         (partial / "scenario.toml").write_text(text, encoding="utf-8")
         keep_law(p, partial)
-        begin(partial, p, checkpoint_every_s)
+        begin(partial, p, checkpoint_every_s, info)
         with _driven(p, partial, info, gui, checkpoint_every_s, None) as simulation:
             yield simulation
         finish(out)
@@ -180,22 +182,24 @@ def resume(folder: Path, progress: Callable[[int, int], Any] | None = None) -> t
             if ours(out) and Run(out).info["status"] == "complete":
                 return Run(out), None
             raise InputError(f"{partial}: no run that could be resumed; begin one with `trainctl run`")
-        info = {k: v for k, v in Run(partial).info.items() if k not in ("failure", "steps", "wall_time_s")}
-        if info["status"] == "complete":
-            remove(partial / checkpoint.FOLDER)
+        place = partial / checkpoint.FOLDER
+        if Run(partial).info.get("status") == "complete" and not os.path.lexists(place / checkpoint.DONE):
+            _whole(partial)
+            _cleared(partial)
             finish(out)
             return Run(out), None
-        info = {**info, "status": "running"}
-        p, every = again(partial)
-        done = partial / checkpoint.FOLDER / checkpoint.DONE
-        if done.exists():
-            _complete(p, partial, info, json.loads(done.read_text(encoding="utf-8")))
+        p, every, info = again(partial)
+        if os.path.lexists(place / checkpoint.DONE):
+            done = unsealed(place / checkpoint.DONE)
+            for name, expected in done["files"].items():
+                verify(partial / name, expected)
+            _complete(p, partial, info, done)
             finish(out)
             return Run(out), None
-        saved = checkpoint.read(partial / checkpoint.FOLDER, p)
-        if saved is None:
-            for name in ("segments", "events.jsonl", "metrics.json", *(path.name for path in partial.glob("*.parquet"))):
-                remove(partial / name)
+        saved = checkpoint.read(place, p)
+        anew = ("segments", EVENTS) if saved is None else ()
+        for name in (*anew, "metrics.json", *(path.name for path in partial.glob("*.parquet"))):
+            remove(partial / name)
         remove(partial / "sumo")
         write_info(partial, info)
         with _driven(p, partial, info, None, every, saved) as simulation:
@@ -211,6 +215,7 @@ def _driven(
 ) -> Iterator[Steps]:
     """The loop in its folder, from the beginning or from a checkpoint, and what is left to do when it has ended."""
     place = partial / checkpoint.FOLDER
+    remove(place / checkpoint.RESERVE)
     # not zeros: some file systems keep no room for those
     (place / checkpoint.RESERVE).write_bytes(os.urandom(checkpoint.RESERVE_BYTES))
     began = time.perf_counter() - (saved.values["wall_time_s"] if saved else 0.0)
@@ -249,9 +254,10 @@ def _driven(
             for at, alarm in simulation.counted(world.collisions()):
                 journal.event(at, "violation", **alarm)
             end = {"steps": simulation.k, **simulation.outcome()}
-            done = {"end": end, "wall_time_s": elapsed(), "recorder": journal.recorder.cut()}
-            checkpoint.replace(place / checkpoint.DONE, json.dumps(plain(done)).encode())
-            journal.close()
+            logs = {name: sum_of(partial / name) for name in written(partial) if name.startswith("sumo/")}
+            recorded = journal.recorder.cut(synced=every_s is not None)
+            done = {"end": plain(end), "wall_time_s": elapsed(), "recorder": recorded, "files": logs}
+            checkpoint.replace(place / checkpoint.DONE, sealed(done))
             _complete(p, partial, info, {**done, "wall_time_s": elapsed()}, journal)
     except BaseException as error:
         if world is not None:
@@ -271,12 +277,27 @@ def _driven(
 
 def _complete(p: Model, partial: Path, info: dict[str, Any], done: dict[str, Any], journal: Journal | None = None) -> None:
     """Join the tables, measure, and say that the run is complete; may be done again after a kill."""
-    if journal is None:
-        Journal(partial, p, done["recorder"]).close()
+    (journal or Journal(partial, p, done["recorder"])).join()
+    remove(partial / "metrics.json")
     write_json(partial / "metrics.json", metrics(Run(partial)))
-    files = [path for path in written(partial) if not path.startswith(f"{checkpoint.FOLDER}/")]
+    files = [path for path in written(partial) if path.partition("/")[0] not in (checkpoint.FOLDER, "segments")]
     write_info(partial, {**info, **done["end"], "status": "complete", "wall_time_s": done["wall_time_s"], "files": files})
+    _cleared(partial)
+
+
+def _cleared(partial: Path) -> None:
+    """Remove what only a run that is going on needs; first the word that there is something left to do."""
+    remove(partial / checkpoint.FOLDER / checkpoint.DONE)
     remove(partial / checkpoint.FOLDER)
+    remove(partial / "segments")
+
+
+def _whole(folder: Path) -> None:
+    """Whether all files of a complete run are there."""
+    names = Run(folder).info.get("files")
+    missing = [name for name in names if not (folder / str(name)).is_file()] if isinstance(names, list) else [INFO]
+    if missing:
+        raise InputError([f"{folder / str(name)}: missing or damaged: run it again with `trainctl run`" for name in missing])
 
 
 class _Between:
@@ -295,7 +316,7 @@ class _Between:
     def __call__(self) -> None:
         asked = self.stop.asked
         if self.tape is not None and (asked is not None or self.simulation.k % self.every == 0):
-            more = {"recorder": self.journal.recorder.cut(), "tape": self.tape.save(), "wall_time_s": self.elapsed()}
+            more = {"recorder": self.journal.recorder.cut(synced=True), "tape": self.tape.save(), "wall_time_s": self.elapsed()}
             assert isinstance(self.simulation, Loop)
             checkpoint.write(self.place, self.simulation, {**self.identity, **more})
         if asked is not None:
@@ -336,30 +357,38 @@ def keep_law(p: Model, folder: Path) -> None:
         (folder / p.scenario.controller.law).write_bytes(p.law.SOURCE)
 
 
-def begin(partial: Path, p: Model, every_s: float | None) -> None:
-    """Put down what ``again`` needs, with the network as it was read."""
+def begin(partial: Path, p: Model, every_s: float | None, info: dict[str, Any]) -> None:
+    """Put down what ``again`` needs, with the network as it was read and the run.json of the beginning."""
     place = partial / checkpoint.FOLDER
     place.mkdir()
     keep_law(p, place)
-    start: dict[str, Any] = {"file": p.file, "checkpoint_every_s": every_s}
+    start: dict[str, Any] = {"file": p.file, "checkpoint_every_s": every_s, "info": plain(info)}
     if p.net is not None:
         start["net"] = unpack(p.net, place).name
     else:
         start["line"] = p.spec.model_dump(mode="json", by_alias=True, exclude_none=True)
     if not p.placed:
         start["roster"] = roster.tables(p.roster)
-    checkpoint.replace(place / checkpoint.START, json.dumps(start).encode())
+    start["files"] = {name: sum_of(partial / name) for name in written(partial) if name != INFO}
+    checkpoint.replace(place / checkpoint.START, sealed(start))
 
 
-def again(partial: Path) -> tuple[Model, float | None]:
-    """The scenario of a run folder, ready to run, and its ``checkpoint_every_s``."""
+def again(partial: Path) -> tuple[Model, float | None, dict[str, Any]]:
+    """The scenario of a run folder, ready to run, its ``checkpoint_every_s``, and the run.json of its beginning.
+
+    Raises
+    ------
+    InputError
+        It was killed before it began, or something it began with is damaged.
+    """
     place = partial / checkpoint.FOLDER
-    try:
-        start = json.loads((place / checkpoint.START).read_text(encoding="utf-8"))
-        text = (partial / "scenario.toml").read_text(encoding="utf-8")
-        data = tomllib.loads(text)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{partial}: it was killed before it began: begin it again with `trainctl run` ({error})") from None
+    if not os.path.lexists(place / checkpoint.START):
+        raise InputError(f"{partial}: it was killed before it began: begin it again with `trainctl run`")
+    start = unsealed(place / checkpoint.START)
+    for name, expected in start["files"].items():
+        verify(partial / name, expected)
+    text = (partial / "scenario.toml").read_text(encoding="utf-8")
+    data = tomllib.loads(text)
     network, file = data["network"], str(place / "network.toml")
     enrolled = None
     if "roster" in start:
@@ -368,6 +397,7 @@ def again(partial: Path) -> tuple[Model, float | None]:
     elif "net" in start:
         data["network"] = {"net": str(place / start["net"])}
     elif network["line"].endswith(".toml"):
+        remove(Path(file))
         Path(file).write_text(tomli_w.dumps(start["line"]), encoding="utf-8")
         data["network"] = {"line": file}
     scenario, found = examine(data, resolved=True)
@@ -378,7 +408,7 @@ def again(partial: Path) -> tuple[Model, float | None]:
     p = dataclasses.replace(p, scenario=original)
     if p.scenario.toml() != text:
         raise InputError(f"{partial / 'scenario.toml'}: changed since the run began, or read by another version; run it again")
-    return p, start["checkpoint_every_s"]
+    return p, start["checkpoint_every_s"], start["info"]
 
 
 def open_world(p: Model, folder: Path, backend: Backend, gui: str | None = None) -> World:

@@ -58,6 +58,11 @@ class Consists(NamedTuple):
     braking: Floats  # N, positive
     braking_power: Floats  # W
     actuator_rate: Floats  # 1/s, r of the actuator tau' = -r tau + r demand
+    installed: Bools = np.zeros(0, np.bool_)  # the force of this unit's train is shared out by installed force; empty: nobody's
+
+    def by_installed_force(self) -> Bools:
+        """Whether the force of every train is shared out by what its units have installed, shape (n,); else it goes by mass."""
+        return self.installed[self.first[:-1]] if len(self.installed) else np.zeros(len(self.first) - 1, np.bool_)
 
     def train_length(self) -> Floats:
         """Length of every train [m], shape (n,)."""
@@ -75,8 +80,12 @@ class Consists(NamedTuple):
     def turned(self, turned: Bools) -> Consists:
         """The same with the units of some trains (n,) in the opposite order."""
         rows, between = (turned_rows(self.first, turned, couplers) for couplers in (False, True))
-        units = Consists(self.first, *(row[rows] for row in self[1:]))
-        return units._replace(stiffness=self.stiffness[between], damping=self.damping[between])
+        return self._replace(
+            length=self.length[rows], mass=self.mass[rows], rotating=self.rotating[rows], davis=self.davis[rows],
+            stiffness=self.stiffness[between], damping=self.damping[between],
+            traction=self.traction[rows], traction_power=self.traction_power[rows],
+            braking=self.braking[rows], braking_power=self.braking_power[rows], actuator_rate=self.actuator_rate[rows],
+        )  # fmt: skip
 
 
 def turned_rows(first: Ints, turned: Bools, couplers: bool = False) -> Ints:
@@ -245,9 +254,10 @@ def restrict(scene: Scene, members: Ints) -> Scene:
     links, rows = scene.links, new[scene.links.receiver] >= 0
     kept = {name: getattr(links, name)[rows] for name in ("desired", "lower", "upper", "weight", "heard")}
     receiver = new[links.receiver[rows]]
+    of_units: list[Any] = [row[units] if len(row) else row for row in scene.consists[1:]]
     return scene._replace(
         trains=[scene.trains[i] for i in members.tolist()],
-        consists=type(scene.consists)(first, *(row[units] for row in scene.consists[1:])),
+        consists=type(scene.consists)(first, *of_units),
         own=scene.own[units],
         links=links._replace(
             sender=new[links.sender[rows]], receiver=receiver, first=np.searchsorted(receiver, np.arange(len(members) + 1)),

@@ -15,8 +15,9 @@ import pandas as pd
 import psutil
 import pytest
 
-from trainctl.studies.results import write_results
-from trainctl.studies.sweep import SweepPlan, jobs, ready_made, simulate, sweep
+from trainctl.studies.jobs import simulate
+from trainctl.studies.results import part, write_results
+from trainctl.studies.sweep import SweepPlan, jobs, ready_made, sweep
 
 BIN = Path(sys.executable).parent
 SEEDS, DURATION = range(8), 300
@@ -34,7 +35,7 @@ def alone(tmp_path_factory):
     settings = {"topology.loss": [0.1], "run.duration_s": [DURATION]}
     rows = [simulate(job) for job in jobs(SweepPlan(made.scenario, settings, SEEDS, made.jitter))]
     path = tmp_path_factory.mktemp("alone") / "results.parquet"
-    write_results(rows, path)
+    write_results(part(rows), range(len(rows)), path)
     return path.read_bytes()
 
 

@@ -16,8 +16,9 @@ from trainctl.runs.run import Run
 from trainctl.scenario.build import open_scenario
 from trainctl.stages.driver import Driven, Driver
 from trainctl.stages.traffic import Traffic
-from trainctl.studies.results import write_results
-from trainctl.studies.sweep import SweepPlan, jobs, simulate
+from trainctl.studies.jobs import simulate
+from trainctl.studies.results import part, write_results
+from trainctl.studies.sweep import SweepPlan, jobs
 from trainctl.sumo.session import collisions
 
 #: A law that never does anything.
@@ -177,7 +178,7 @@ def test_in_a_sweep_a_collision_is_a_result(tmp_path):
     path = line(tmp_path / "s", RAMS)
     found = [simulate(job) for job in jobs(SweepPlan(str(path), {"run.duration_s": [20, 50]}, [], {}, "numeric"))]
     assert [(row["status"], row["collisions"], row["gridlocks"]) for row in found] == [("complete", 0, 0), ("complete", 1, 0)]
-    frame = write_results(found, tmp_path / "results.parquet")
+    frame = write_results(part(found), [0, 1], tmp_path / "results.parquet")
     assert frame["collisions"].tolist() == pd.read_parquet(tmp_path / "results.parquet")["collisions"].tolist() == [0, 1]
 
 
@@ -268,8 +269,8 @@ def test_a_run_that_is_resumed_in_a_circle_tells_it_once(circle, tmp_path):
             raise RuntimeError("pulled")
         again, since = resume(tmp_path / name)
         assert since is not None and when - 20.0 <= since <= when
-        for part in ("events.jsonl", "trains.parquet", "metrics.json"):
-            assert (again.folder / part).read_bytes() == (straight.folder / part).read_bytes(), (name, part)
+        for file in ("events.jsonl", "trains.parquet", "metrics.json"):
+            assert (again.folder / file).read_bytes() == (straight.folder / file).read_bytes(), (name, file)
         same = [{k: v for k, v in done.info.items() if k not in ("wall_time_s", "command_line")} for done in (again, straight)]
         assert same[0] == same[1]
 

@@ -25,6 +25,7 @@ from trainctl.cli import program as cli
 from trainctl.diff.tolerance import read_tolerances
 from trainctl.scenario.build import open_scenario
 from trainctl.studies import sweep
+from trainctl.studies.jobs import job_model
 
 ROOT = Path(__file__).parents[2]
 PAGES = (
@@ -134,7 +135,7 @@ def checked(text: str, folder: Path) -> None:
     elif "scenario" in tomllib.loads(text):
         plan = sweep.ready_made(str(folder / name))
         assert plan is not None
-        sweep.job_model(sweep.jobs(plan)[0])
+        job_model(sweep.jobs(plan)[0])
     else:
         open_scenario(str(folder / name))
 

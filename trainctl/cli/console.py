@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from trainctl.errors import InputError
+from trainctl.errors import InputError, visible
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -27,9 +27,6 @@ PIPED = 1000
 
 #: Smaller numbers are shown as 0.
 ROUNDING = 1e-9
-
-#: Control characters but tab and newline, and how they are shown.
-STEERING = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\t\n"}
 
 
 app = typer.Typer(
@@ -141,11 +138,6 @@ def number(value: Any) -> str:
         return f"{value:.3e}"
     text = f"{round(value, digits):.{max(digits, 0)}f}"
     return text.rstrip("0").rstrip(".") if "." in text else text
-
-
-def visible(text: str) -> str:
-    """Text as it is written: characters that steer a terminal, which titles and ids may hold, are shown as hexadecimal escapes."""
-    return text.translate(STEERING)
 
 
 def fill(table: Table, *cells: RenderableType) -> None:

@@ -146,4 +146,6 @@ def _summary(folder: Path, info: dict[str, Any]) -> None:
         say(f"in {count} of {info['complete']} runs the formation did not settle within 1 m")
     for reason in info["reasons"]:
         say(reason)
+    for why, count in info["alone"].items():
+        say(f"{count} of {info['runs']} runs one by one, not side by side: {why}")
     say(f"results: {folder}/  (results.parquet, summary.png)")

@@ -25,7 +25,10 @@ from trainctl.diff.sources import KINDS, sumo_log, sumo_logs_in
 from trainctl.errors import InputError
 from trainctl.record.folder import INFO, beside, free, installed, ours, remove, write_info, write_json
 from trainctl.runs.run import Run
-from trainctl.runs.sumo_logs import kind_of
+from trainctl.runs.sumo_logs import kind_of, opened
+
+#: SUMO's header stands in the first bytes of a log.
+HEADER_BYTES = 1 << 20
 
 #: Entry of run.json and golden.json: the logs that hold only some instants.
 THINNED = "thinned"
@@ -137,9 +140,9 @@ def _of_logs(logs: dict[str, Path], place: Path, every_s: float) -> None:
 
 def _pack(path: Path, target: Path) -> None:
     """A text log compressed, without SUMO's header, which has the date and the folder in it."""
-    data = path.read_bytes()
-    text = gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data
-    target.write_bytes(gzip.compress(re.sub(rb"<!--.*?-->\s*", b"", text, count=1, flags=re.DOTALL), 9, mtime=0))
+    with opened(path) as stream, target.open("wb") as raw, gzip.GzipFile("", "wb", 9, raw, mtime=0) as packed:
+        packed.write(re.sub(rb"<!--.*?-->\s*", b"", stream.read(HEADER_BYTES), count=1, flags=re.DOTALL))
+        shutil.copyfileobj(stream, packed, HEADER_BYTES)
 
 
 def _wanted(at: Any, every_s: float, end: float) -> Any:

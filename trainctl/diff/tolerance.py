@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sumo_net.bounded import short_text
 from trainctl.errors import InputError
 from trainctl.runs.kinds import KINDS
 
@@ -149,7 +150,7 @@ def read_tolerances(path: Path | str) -> Tolerances:
         With one line per mistake.
     """
     try:
-        data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        data = tomllib.loads(short_text(Path(path)))
     except (ValueError, RecursionError) as error:  # not TOML, not text, a number of 5000 digits
         raise InputError(f"{path}: not a TOML file: {error}") from None
     except OSError as error:

@@ -56,14 +56,14 @@ def overlay(drawn: Sequence[Drawn], names: Sequence[str], what: str) -> Figure:
         for k, line in enumerate(one.value.reshape(len(one.time), -1).T):
             style.draw(axes, one.time, line, color=colour, linewidth=1.0, label=name.replace("_", " ") if k == 0 else f"_{name}")
     if what == "spacing_errors":
-        axes.set_yscale("log")
+        style.logarithmic(axes)
         axes.set_ylim(bottom=SMALLEST_M)
     else:
         _clip(axes, curves, names)
     absent = [name.replace("_", " ") for one, name in zip(curves, names, strict=True) if not len(one.time)]
     axes.set_title("; ".join([words, *([f"no links in {', '.join(absent)}"] if absent else [])]), loc="left")
     relative = what == "positions" and any(one.known.reference is not None for one in drawn)
-    axes.set_ylabel(f"{label[:-5]}, less the reference [km]" if relative else label)
+    axes.set_ylabel(f"{label[:-5]}, less the reference [km]" if relative else label, parse_math=True)
     instants = [one.instants for one in drawn if len(one.instants)]
     axes.set_xlim(min(float(at[0]) for at in instants), max(float(at[-1]) for at in instants))
     axes.set_xlabel("time [s]")

@@ -14,8 +14,10 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, MultipleLocator
+from matplotlib.text import Text
+from matplotlib.ticker import FuncFormatter, LogFormatter, MultipleLocator
 
+from trainctl.errors import visible
 from trainctl.signals import Floats
 
 #: Okabe and Ito's colours, the ones that read well on white first.
@@ -61,6 +63,7 @@ SETTINGS: Any = {
     "ytick.labelsize": 7.0, "lines.linewidth": 1.0, "axes.linewidth": 0.6, "axes.grid": True, "grid.linewidth": 0.3,
     "grid.color": "#cccccc", "axes.axisbelow": True, "axes.spines.top": False, "axes.spines.right": False,
     "axes.formatter.useoffset": False, "svg.hashsalt": "trainctl", "svg.fonttype": "none", "pdf.fonttype": 42,
+    "text.parse_math": False,  # names are no formulas
 }  # fmt: skip
 
 
@@ -80,8 +83,25 @@ def panels(rows: int, width: str, height_mm: float = 42.0, **options: Any) -> tu
     return figure, list(axes[:, 0])
 
 
+def logarithmic(axes: Axes) -> None:
+    """A logarithmic vertical axis; its numbers are plain text, as all words in a figure are."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(LogFormatter())
+    axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
+
+
+def written_out(figure: Figure) -> None:
+    """Show what steers a terminal in a name or a title as an escape."""
+    for text in figure.findobj(Text):
+        assert isinstance(text, Text)
+        if visible(text.get_text()) != text.get_text():
+            text.set_text(visible(text.get_text()))
+
+
 def name_lines(figure: Figure, width: str) -> None:
     """Name the lines of every panel: trains and links beside their ends, what else there is in one legend above."""
+    for line in (line for axes in figure.axes for line in axes.lines):
+        line.set_label(visible(str(line.get_label())))
     shared: dict[str, Any] = {}
     for axes in figure.axes:
         fit(axes)
@@ -335,6 +355,7 @@ def save(figure: Figure, path: Path, formats: Sequence[str], title: str = "", or
     for kind in formats:
         target = path.with_name(f"{path.name}.{kind}")
         with styled():
+            written_out(figure)
             figure.savefig(target, dpi=DPI, metadata={k: v for k, v in undated[kind].items() if v is not None or k in UNDATED})
         written.append(target)
     return written

@@ -94,7 +94,7 @@ def _on_tracks(drawn: Drawn) -> Figure:
                 )  # fmt: skip
     axes[0].set_ylabel("position [km]")
     if reference is not None:
-        axes[1].set_ylabel("gained on the reference\nsince the start [km]" if crowd else r"$x_i - x_r$ [km]")
+        axes[1].set_ylabel("gained on the reference\nsince the start [km]" if crowd else r"$x_i - x_r$ [km]", parse_math=True)
     style.time_axis(axes, drawn.instants[0], drawn.instants[-1], drawn.clock)
     mark_events(axes, drawn)
     style.name_places(axes[0], [(p.at_m / 1000, p.name, p.kind) for p in crossovers(drawn.run, drawn.trains)])

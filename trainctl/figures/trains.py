@@ -104,7 +104,7 @@ def positions(drawn: Drawn) -> Figure:
     if reference is not None:
         instants = drawn.instants
         style.draw(axes[0], instants, leader_over(reference, instants)[0] / 1000, color="black", linestyle=":", label="reference")
-        axes[1].set_ylabel(r"$x_i - x_r$ [km]")
+        axes[1].set_ylabel(r"$x_i - x_r$ [km]", parse_math=True)
     axes[0].set_ylabel("position [km]")
     _finish(figure, axes, drawn)
     return figure
@@ -144,9 +144,9 @@ def spacing_errors(drawn: Drawn) -> Figure:
     looks = _looks(drawn.links.names)
     for name, rows in drawn.links.slices():
         style.draw(axes[0], time[rows], np.maximum(error[rows], 1e-3 * smallest), **looks[name])
-    axes[0].set_yscale("log")
+    style.logarithmic(axes[0])
     axes[0].set_ylim(bottom=max(smallest, 0.5 * error[error > 0].min(initial=np.inf)) if (error > smallest).any() else smallest)
-    axes[0].set_ylabel(r"$|x_{ij} - d_{ij}|$ [m]")
+    axes[0].set_ylabel(r"$|x_{ij} - d_{ij}|$ [m]", parse_math=True)
     _finish(figure, axes, drawn)
     return figure
 
@@ -192,7 +192,7 @@ def draw_inputs(panel: Axes, drawn: Drawn) -> None:
     """Draw applied inputs, held until the next row, and bounds into a panel."""
     style.bound(panel, *_distinct(drawn.known.input_mps2.values()))
     _draw_trains(panel, drawn, drawn.trains.column("input_mps2"), drawstyle="steps-post")
-    panel.set_ylabel(r"input [m/s$^2$]")
+    panel.set_ylabel(r"input [m/s$^2$]", parse_math=True)
 
 
 def speeds_and_inputs(drawn: Drawn) -> Figure:

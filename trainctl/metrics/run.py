@@ -242,16 +242,9 @@ def of_strings(links: Pairs) -> Values:
     if not links.names:
         return {}
     rows = dict(links.slices())
-    nearest: dict[str, tuple[float, str, str]] = {}  # of each train: length, ahead, name of its shortest link ahead
-    for (ahead, behind), (name, part) in zip(links.ends, rows.items(), strict=True):
-        length = float(np.median(links.column("desired_m")[part]))
-        nearest[behind] = min(nearest.get(behind, (np.inf, "", "")), (length, ahead, name))
     values: Values = {}
     time, error = np.round(links.column("time_s") / INSTANT), links.column("error_m")
-    for behind, (_, ahead, name) in nearest.items():
-        if ahead not in nearest:
-            continue
-        before = nearest[ahead][2]
+    for behind, before, name in nearest(links):
         _, a, b = np.intersect1d(time[rows[before]], time[rows[name]], assume_unique=True, return_indices=True)
         front, back = error[rows[before]][a], error[rows[name]][b]
         for kind, norm in (("l2", np.linalg.norm), ("peak", lambda e: np.max(np.abs(e), initial=0.0))):
@@ -260,6 +253,15 @@ def of_strings(links: Pairs) -> Values:
                 values[f"{key}/{behind}"] = gain
                 values[key] = max(gain, float(values.get(key) or 0.0))
     return values
+
+
+def nearest(links: Pairs) -> list[tuple[str, str, str]]:
+    """Links of neighbours that follow each other: the train behind, and the names of the link ahead and of its own."""
+    found: dict[str, tuple[float, str, str]] = {}  # of each train: length, ahead, name of its shortest link ahead
+    for (ahead, behind), (name, part) in zip(links.ends, links.slices(), strict=True):
+        length = float(np.median(links.column("desired_m")[part]))
+        found[behind] = min(found.get(behind, (np.inf, "", "")), (length, ahead, name))
+    return [(behind, found[ahead][2], name) for behind, (_, ahead, name) in found.items() if ahead in found]
 
 
 def of_watched(trains: Series) -> Values:

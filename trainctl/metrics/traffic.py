@@ -205,6 +205,7 @@ def _of_rows(batches: Iterable[pa.Table], path: Path, parked: Mapping[str, Seque
             raise InputError(f"{path}: time does not ascend: {after:.10g} s after {before:.10g} s")
         begin, end = min(begin, float(time[0])), float(time[-1])
         names.update(batch["id"].unique().to_pylist())
+        _once(path, time, batch["id"])
         steps += 1 + int(np.count_nonzero(np.diff(time) > INSTANT))
         rows, standing = rows + len(time), standing + int(np.count_nonzero(speed < 0.1))
         speed_sum, speed_max = speed_sum + float(speed.sum()), max(speed_max, float(speed.max()))
@@ -223,6 +224,18 @@ def _of_rows(batches: Iterable[pa.Table], path: Path, parked: Mapping[str, Seque
         if mean.count:
             values |= {f"fcd.{name}_min_{unit}": mean.minimum, f"fcd.{name}_mean_{unit}": mean.total / mean.count}
     return values
+
+
+def _once(path: Path, time: Floats, ids: pa.ChunkedArray) -> None:
+    """Refuse a log in which a vehicle stands twice at one instant: it would be no distance ahead of itself."""
+    coded = ids.combine_chunks().dictionary_encode()
+    instant = np.concatenate(([0], np.cumsum(np.diff(time) > INSTANT)))
+    key = np.sort(instant * len(coded.dictionary) + coded.indices.to_numpy(zero_copy_only=False))
+    again = np.flatnonzero(key[1:] == key[:-1])
+    if len(again):
+        k, who = divmod(int(key[again[0]]), len(coded.dictionary))
+        at = time[int(np.searchsorted(instant, k))]
+        raise InputError(f"{path}: vehicle {coded.dictionary[who].as_py()} stands twice at {at:.10g} s")
 
 
 def _on_lane(batch: pa.Table, parked: Mapping[str, Sequence[tuple[float, float]]]) -> pa.Table:

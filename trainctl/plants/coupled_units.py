@@ -271,9 +271,10 @@ def room(consists: Consists, lower: Floats, upper: Floats) -> tuple[Floats, Floa
     -----
     Each unit carries its own mass's share, so the unit weakest per mass decides, traction at the speed where power leaves the
     minimum. Where rotating mass or Davis coefficients differ between units, their share of the input does too: it is taken at
-    161 speeds of the band.
+    161 speeds of the band. Where the force is shared out by installed force the train gives all that its units have.
     """
     low, high = np.full(len(lower), -np.inf), np.full(len(lower), np.inf)
+    together = consists.by_installed_force()
     for i, (a, b) in enumerate(pairwise(consists.first)):
         if not np.isfinite([lower[i], upper[i]]).all():
             continue
@@ -284,6 +285,11 @@ def room(consists: Consists, lower: Floats, upper: Floats) -> tuple[Floats, Floa
         with np.errstate(divide="ignore"):
             traction = np.minimum(consists.traction[a:b], consists.traction_power[a:b] / speeds) / m
             braking = np.minimum(consists.braking[a:b], consists.braking_power[a:b] / speeds) / m
+        if together[i]:
+            inertia = float(m @ rotating)
+            high[i] = (((traction - r) @ m)[:, None] / inertia + mean).min()
+            low[i] = (((-braking - r) @ m)[:, None] / inertia + mean).max()
+            continue
         high[i] = ((traction - r) / rotating + mean).min()
         low[i] = ((-braking - r) / rotating + mean).max()
     return low, high
@@ -307,7 +313,12 @@ def relied_on(
     fastest = np.maximum(np.repeat(top, units), 1e-9)
     force = np.minimum(consists.braking, consists.braking_power / fastest)
     down, weight = np.repeat(fall, units), np.add.reduceat(consists.mass, leading)
-    given = np.add.reduceat(share * np.minimum(force, inertia * braking + consists.mass * down), leading) - weight * fall
+    needed = inertia * braking + consists.mass * down
+    all_of, every = np.add.reduceat(force, leading), np.add.reduceat(needed, leading)
+    part = np.repeat(np.minimum(every / all_of, 1.0), units)  # of its force, by installed force; infinite ones give what is needed
+    own_part = np.repeat(consists.by_installed_force(), units) & np.isfinite(force)
+    give = np.where(own_part, np.where(np.isfinite(force), force, 0.0) * part, np.minimum(force, needed))
+    given = np.add.reduceat(share * give, leading) - weight * fall
     strongest = np.minimum(consists.traction, consists.traction_power / fastest)  # may be infinite, and a share 0
     pull = np.add.reduceat(np.multiply(share, strongest, out=np.zeros_like(share), where=share > 0.0), leading)
     zero = np.zeros(len(top))

@@ -4,6 +4,10 @@ Every unit carries its own mass's share, so couplers at rest stay at rest and th
 coupler carries beyond that is damped by pairs of forces that cancel within the train. The functions have the shape of a continuous
 law, to be integrated with ``plants.coupled_units``; they also serve trains that the supervisor, or a driver, takes from such a law.
 
+By installed force, as motor cars and trailers do, every unit gives the same part of what it can give: the train as a whole moves by
+``a``, couplers carry what a unit gives more than its own mass needs, and swing about that as their own stiffness and damping let
+them. There are no pairs of forces then: a trailer has no motor to damp its couplers with.
+
 Symbols
 -------
 a_i         acceleration train i holds [m/s2]; where orders replace a law, NaN leaves the train to the law
@@ -38,7 +42,7 @@ from trainctl.plants.coupled_units import (
     room,
     slope_at,
 )
-from trainctl.signals import GRAVITY, POSITION, SPEED, Consists, Floats, Ints, Links
+from trainctl.signals import GRAVITY, POSITION, SPEED, Bools, Consists, Floats, Ints, Links
 
 CLOCK: Literal["continuous"] = "continuous"
 ORDER: Literal["parallel"] = "parallel"
@@ -55,17 +59,21 @@ class Constants(NamedTuple):
     acceleration: Floats  # (n,) m/s2, overwritten once per control period, or for orders per step of the simulator
     stiffness: float  # 1/s2
     damping: float  # 1/s
+    installed: Bools  # (n,) by installed force, not by mass
 
 
 #: No train.
-NOBODY = Constants(np.zeros(1, dtype=np.int64), np.zeros((0, SLOPE + 1)), np.zeros((0, 2)), np.zeros(0), 0.0, 0.0)
+NOBODY = Constants(
+    np.zeros(1, dtype=np.int64), np.zeros((0, SLOPE + 1)), np.zeros((0, 2)), np.zeros(0), 0.0, 0.0, np.zeros(0, np.bool_)
+)
 
 
 def constants(params: coupled_units.Params, consists: Consists, gradient: Floats | None = None) -> Constants:
     """Constants for these trains, all holding acceleration 0; the units believe the nominal running resistance."""
     first, units, slopes = coupled_units.constants(params, consists, gradient)
     held = np.zeros(len(first) - 1)
-    return Constants(first, units, slopes, held, params.in_train_stiffness_per_s2, params.in_train_damping_per_s)
+    stiffness, damping = params.in_train_stiffness_per_s2, params.in_train_damping_per_s
+    return Constants(first, units, slopes, held, stiffness, damping, consists.by_installed_force())
 
 
 @inlined()
@@ -77,6 +85,9 @@ def demand(
 
     The pairs, one per coupler, are scaled by one factor per train so that no unit leaves its limits because of them.
     """
+    if constants.installed[i]:
+        by_installed_force(i, constants, own, out)
+        return
     start, a_i = constants.first[i], constants.acceleration[i]
     units, gradient = constants.units, constants.gradient
     last = len(out) - 1
@@ -106,6 +117,28 @@ def demand(
             f = (1.0 - scale) * pair(constants, start + j, own, j)
             out[j] += f
             out[j + 1] -= f
+
+
+@inlined()
+def by_installed_force(i: int, constants: Constants, own: Floats, out: Floats) -> None:
+    """Write the same part of what each unit of train ``i`` can give [N] into ``out``, so that the train moves by a_i."""
+    start, units = constants.first[i], constants.units
+    wanted = 0.0
+    for j in range(len(out)):
+        row = start + j
+        load = running_resistance(own[j, SPEED], units[row, C0], units[row, C1], units[row, C2])
+        load += GRAVITY * (units[row, SLOPE] + slope_at(own[j, POSITION], constants.gradient))
+        wanted += units[row, INERTIA] * constants.acceleration[i] + units[row, MASS] * load
+    given = 0.0
+    for j in range(len(out)):
+        row = start + j
+        if wanted > 0.0:
+            out[j] = available(own[j, SPEED], units[row, TRACTION], units[row, TRACTION_POWER])
+        else:
+            out[j] = available(own[j, SPEED], units[row, BRAKING], units[row, BRAKING_POWER])
+        given += out[j]
+    for j in range(len(out)):
+        out[j] *= wanted / given
 
 
 @inlined(inline="always")

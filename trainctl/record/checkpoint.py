@@ -6,14 +6,15 @@ run, in ``DIR.partial/checkpoint``:
 
 ==============  ======================================================================================================
 start.json      what was asked for; with the network, and the trains of a SUMO configuration, as they were read, so that a run
-                can begin again from its folder alone
+                can begin again from its folder alone; check sums of the files that stand beside it
 moves.bin       every displacement SUMO was told, n float64 per step; what lies beyond the last checkpoint is dropped
 state.npz       the last checkpoint, with routes and entries, replaced atomically; written after everything it counts on is closed
-done.json       all steps are done and closed; only joining, measuring and renaming are left
+done.json       all steps are done and closed; only joining, measuring and renaming are left; check sums of SUMO's logs
 reserve         room on the disk for the words that say that the disk is full
 ==============  ======================================================================================================
 
-Arrays and JSON only: reading a checkpoint runs no code of its writer.
+Arrays and JSON only: reading a checkpoint runs no code of its writer. Everything a run goes on from has a check sum (``sums``): a
+damaged folder is refused in words.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ from numpy.typing import NDArray
 from trainctl.errors import InputError, SimulatorError
 from trainctl.railway.ways import Ways
 from trainctl.record.folder import FORMAT, installed
+from trainctl.record.recorder import sync
+from trainctl.record.sums import PIECE, verify
 from trainctl.scenario.model import Model
 from trainctl.signals import Floats, Ints, Links, Seen, Start
 from trainctl.world import World
@@ -48,13 +51,13 @@ START, MOVES, STATE, DONE, RESERVE = "start.json", "moves.bin", "state.npz", "do
 LOOKS_ON = ("cli", "diff", "figures", "metrics", "record", "report", "runs", "studies")
 
 #: Version of the checkpoint itself.
-VERSION = 1
+VERSION = 2
 
 #: Enough for run.json on any file system.
 RESERVE_BYTES = 1 << 16
 
-#: Displacements are written in pieces of about this size [bytes].
-PIECE = 1 << 20
+#: What numpy and zipfile say of a damaged archive (RuntimeError: encrypted, or a way of packing that is unknown).
+UNREADABLE = (OSError, ValueError, LookupError, TypeError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error)
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -93,23 +96,14 @@ class Tape:
         self.routes, self.entries, self.parked = list(told["routes"]), list(told["entries"]), list(told["parked"])
         self.turns = list(told["turns"])
         self.buffer = bytearray()
+        size = 8 * self.steps * self.trains
+        if saved:
+            verify(self.path, [size, self.crc], beginning=True)
         # unbuffered: what did not fit on the disk must not come back when the file is closed
         self.file = open(self.path, "r+b" if saved else "wb", buffering=0)  # noqa: SIM115  closed by close()
         if saved:
-            try:
-                self._rewind(8 * self.steps * self.trains)
-            except InputError:
-                self.file.close()
-                raise
-
-    def _rewind(self, size: int) -> None:
-        crc, left = 0, size
-        while left and (piece := self.file.read(min(PIECE, left))):
-            crc, left = zlib.crc32(piece, crc), left - len(piece)
-        if left or crc != self.crc:
-            raise InputError(f"{self.path}: damaged: not what the checkpoint counts on")
-        self.file.truncate(size)
-        self.file.seek(size)
+            self.file.truncate(size)
+            self.file.seek(size)
 
     def replay(self, step: float) -> None:
         """Tell the world, which has just started, everything once more."""
@@ -241,11 +235,7 @@ def replace(path: Path, content: bytes) -> None:
             rest = rest[file.write(rest) :]
         os.fsync(file.fileno())
     os.replace(new, path)
-    at = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(at)
-    finally:
-        os.close(at)
+    sync(path.parent)
 
 
 def read(folder: Path, p: Model) -> Saved | None:
@@ -257,13 +247,20 @@ def read(folder: Path, p: Model) -> Saved | None:
         It was made by other versions or another scenario, or is damaged.
     """
     path = folder / STATE
-    if not path.exists():
+    if not os.path.lexists(path):
         return None
     try:
-        with path.open("rb") as whole, np.load(whole, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        with path.open("rb") as whole:
+            with zipfile.ZipFile(whole) as parts:  # as written: nothing in it is larger than it is in the file
+                if any(part.compress_type != zipfile.ZIP_STORED for part in parts.infolist()):
+                    raise ValueError("packed")
+            whole.seek(0)
+            with np.load(whole, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files}
         values = json.loads(bytes(arrays.pop("json")))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        if not isinstance(values, dict):
+            raise TypeError("no table")
+    except UNREADABLE as error:
         raise InputError(f"{path}: not a checkpoint of trainctl: {error}") from None
     now = identity(p)
     wrong = [

@@ -38,7 +38,7 @@ def ours(folder: Path) -> bool:
     """True if the folder holds a run of ours, of whatever status."""
     try:
         return bool(json.loads((folder / INFO).read_text(encoding="utf-8"))["format"] == FORMAT)
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return False
 
 
@@ -59,7 +59,7 @@ def beside(folder: Path) -> list[str]:
     try:
         info = json.loads((folder / INFO).read_text(encoding="utf-8"))
         own = set(info["files"]) if info["status"] == "complete" else None
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return []
     if own is None:
         return []

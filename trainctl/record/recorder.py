@@ -13,7 +13,8 @@ In short::
 
 Until ``close`` the rows lie in closed segments (``segments/trains-00000.parquet``), because a Parquet file that was not closed
 cannot be read: a run that is killed, or whose disk is full, keeps all but its last segment. ``recorder.cut()`` begins a new one
-at any time (say every ten seconds of wall time); the final files do not depend on where the segments were cut.
+at any time (say every ten seconds of wall time); the final files do not depend on where the segments were cut. What ``cut``
+returns has a check sum of everything written until then: a recording that is resumed verifies it first.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -33,12 +35,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from trainctl.record import columns
 from trainctl.record.folder import SCHEMA_VERSION, plain, remove
+from trainctl.record.sums import Sum, sum_of, verify
 from trainctl.signals import POWERS
 
 #: A column: a number, or one of a fixed list of names (written as integer codes into that list; -1 is "none").
 Column = Literal["float", "int", "bool"] | Sequence[str]
 Columns = Mapping[str, Column]
 
+EVENTS = "events.jsonl"
 GROUP_ROWS = 65_536
 SEGMENT_GROUPS = 16
 
@@ -114,6 +118,11 @@ class Recorder:
         two runs of the same scenario.
     resume : mapping, optional
         What ``cut`` returned: everything recorded later is dropped and the recording goes on from there.
+
+    Raises
+    ------
+    InputError
+        What is to be resumed is damaged or cut short.
     """
 
     def __init__(
@@ -128,16 +137,21 @@ class Recorder:
     ) -> None:
         self.folder = folder
         self._segments = folder / "segments"
-        self._segments.mkdir(exist_ok=True)
         kept = dict(resume["segments"]) if resume else {}
+        self._said: Sum = list(resume["events"]) if resume else [0, 0]
+        if resume:
+            verify(folder / EVENTS, self._said, beginning=True)
+            for name in tables:
+                _verified(self._segments, name, kept.get(name, []))
+        self._segments.mkdir(exist_ok=True)
         self._tables = {
-            name: _Segments(self._segments, name, columns, dict(metadata or {}), group_rows, segment_groups, kept.get(name, 0))
+            name: _Segments(self._segments, name, columns, dict(metadata or {}), group_rows, segment_groups, kept.get(name, []))
             for name, columns in tables.items()
         }
         # unbuffered: a line that did not fit on the disk must not come back when the file is closed
-        self._events = open(folder / "events.jsonl", "r+b" if resume else "wb", buffering=0)  # noqa: SIM115  closed by close()
+        self._events = open(folder / EVENTS, "r+b" if resume else "wb", buffering=0)  # noqa: SIM115  closed by close()
         if resume:
-            self._events.truncate(resume["events_bytes"])
+            self._events.truncate(self._said[0])
             self._events.seek(0, os.SEEK_END)
 
     def write(self, table: str, **values: ArrayLike) -> None:
@@ -148,14 +162,25 @@ class Recorder:
         """Append a line to events.jsonl, at once."""
         line = json.dumps(plain({"time_s": time_s, "kind": kind, **fields}), separators=(",", ":")).encode() + b"\n"
         if self._events.write(line) < len(line):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.folder / "events.jsonl"))
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.folder / EVENTS))
+        self._said = [self._said[0] + len(line), zlib.crc32(line, self._said[1])]
 
-    def cut(self) -> dict[str, Any]:
-        """Close the segments, so that all rows until now survive a kill. Returns what ``resume`` needs (plain JSON)."""
+    def cut(self, synced: bool = False) -> dict[str, Any]:
+        """Close the segments, so that all rows until now survive a kill; ``synced``: also a power failure.
+
+        Returns
+        -------
+        dict
+            What ``resume`` needs, plain JSON: length and check sum of every segment, and of the events.
+        """
         for table in self._tables.values():
             table.cut()
-        os.fsync(self._events.fileno())
-        return {"segments": {name: t.count for name, t in self._tables.items()}, "events_bytes": self._events.tell()}
+        if synced:
+            for table in self._tables.values():
+                table.sync()
+            sync(self._segments)
+            os.fsync(self._events.fileno())
+        return {"segments": {name: t.sums() for name, t in self._tables.items()}, "events": list(self._said)}
 
     def leave(self) -> None:
         """End without joining the segments: all rows until now are readable, and ``cut`` of before can be resumed."""
@@ -175,10 +200,10 @@ class Recorder:
         if failed is not None:
             raise failed
 
-    def close(self) -> None:
-        """Write ``<table>.parquet`` from the segments and remove them. If the disk is full the segments stay readable.
+    def join(self) -> None:
+        """Write ``<table>.parquet`` from the segments, which stay. If the disk is full they are what can be read.
 
-        May be done again after a kill: what is joined already stays.
+        May be done again after a kill, by a recorder that resumes the last ``cut``.
         """
         if self._events.closed:
             return
@@ -186,7 +211,12 @@ class Recorder:
         self._cut_all()
         for name, table in self._tables.items():
             table.join(self.folder / f"{name}.parquet")
-        remove(self._segments)
+
+    def close(self) -> None:
+        """Write ``<table>.parquet`` from the segments and remove them."""
+        if not self._events.closed:
+            self.join()
+            remove(self._segments)
 
     def __enter__(self) -> Self:
         """Itself."""
@@ -201,22 +231,52 @@ class Recorder:
                 raise
 
 
+def sync(folder: Path) -> None:
+    """Have the names in a folder written to the disk."""
+    at = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(at)
+    finally:
+        os.close(at)
+
+
+def _segment(folder: Path, name: str, number: int) -> Path:
+    return folder / f"{name}-{number:05d}.parquet"
+
+
+def _verified(folder: Path, name: str, sums: Sequence[Sum]) -> None:
+    """Whether the segments of a table are what they were. A single one may have become the table already."""
+    whole = folder.parent / f"{name}.parquet"
+    for number, expected in enumerate(sums):
+        path = _segment(folder, name, number)
+        verify(whole if len(sums) == 1 and not os.path.lexists(path) and whole.exists() else path, expected)
+
+
 class _Segments:
     """One table as a row of closed files ``<name>-<number>.parquet``; the one being written ends in ``.open``."""
 
     def __init__(
-        self, folder: Path, name: str, columns: Columns, metadata: dict[str, str], group_rows: int, segment_groups: int, kept: int
+        self,
+        folder: Path,
+        name: str,
+        columns: Columns,
+        metadata: dict[str, str],
+        group_rows: int,
+        segment_groups: int,
+        kept: list[Sum],
     ) -> None:
-        self.folder, self.name, self.columns, self.count = folder, name, columns, kept
+        self.folder, self.name, self.columns, self.count = folder, name, columns, len(kept)
+        self.known, self.synced = list(kept), len(kept)  # check sums of the first segments; how many are on the disk
         self.metadata = {"table": name, **metadata}
         self.group_rows, self.segment_rows = group_rows, group_rows * segment_groups
         self.stream: _Stream | None = None
+        counted = {self.path(number) for number in range(self.count)}
         for path in folder.glob(f"{name}-*"):
-            if path.suffix == ".open" or int(path.stem.rpartition("-")[2]) >= kept:
-                path.unlink()
+            if path not in counted:
+                remove(path)
 
     def path(self, number: int) -> Path:
-        return self.folder / f"{self.name}-{number:05d}.parquet"
+        return _segment(self.folder, self.name, number)
 
     def open_path(self) -> Path:
         return self.path(self.count).with_suffix(".open")
@@ -244,6 +304,16 @@ class _Segments:
         os.replace(self.open_path(), self.path(self.count))
         self.count += 1
 
+    def sums(self) -> list[Sum]:
+        self.known += [sum_of(self.path(number)) for number in range(len(self.known), self.count)]
+        return list(self.known)
+
+    def sync(self) -> None:
+        for number in range(self.synced, self.count):
+            with self.path(number).open("rb") as file:
+                os.fsync(file.fileno())
+        self.synced = self.count
+
     def drop(self) -> None:
         """Give up the segment being written: without its end it cannot be read, and its room on the disk is needed."""
         self.stream = None
@@ -251,10 +321,9 @@ class _Segments:
 
     def join(self, target: Path) -> None:
         """One file of full row groups out of all segments, the same bytes wherever they were cut."""
-        if target.exists():  # before a kill
-            return
         if self.count == 1:  # its groups are full already
-            os.replace(self.path(0), target)
+            if self.path(0).exists():  # else it was moved before a kill
+                os.replace(self.path(0), target)
             return
         unfinished = target.with_suffix(".open")
         try:

@@ -7,7 +7,6 @@ folder), ``run.events``, ``run.info``, ``run.metrics`` and ``run.scenario``.
 from __future__ import annotations
 
 import json
-import math
 import tomllib
 from collections.abc import Iterator
 from functools import cached_property
@@ -20,7 +19,15 @@ import pyarrow.parquet as pq
 
 from trainctl.errors import InputError
 from trainctl.record.folder import FORMAT, INFO, SCHEMA_VERSION
-from trainctl.runs.schema import check_table
+from trainctl.runs.schema import INFO as FIELDS
+from trainctl.runs.schema import check_table, is_event, wrong_fields
+
+#: run.json, metrics.json and scenario.toml are not longer than this [bytes], nor a line of events.jsonl.
+MOST_BYTES = 1 << 24
+#: No run has more events.
+MOST_EVENTS = 1_000_000
+#: A table may take so much memory [bytes], or as many times what it takes on the disk.
+TABLE_BYTES, TIMES = 1 << 28, 1000
 
 
 class Run:
@@ -50,6 +57,8 @@ class Run:
             raise InputError(
                 f"{self.folder / INFO}: schema_version = {info.get('schema_version')}: this trainctl reads {SCHEMA_VERSION}"
             )
+        if wrong := wrong_fields(info, FIELDS, False):
+            raise InputError([f"{self.folder / INFO}: {key} = {str(info[key])[:60]}: not what a run has there" for key in wrong])
         self.info: dict[str, Any] = info
 
     def __repr__(self) -> str:
@@ -90,15 +99,16 @@ class Run:
     def events(self) -> list[dict[str, Any]]:
         """The lines of events.jsonl. A last line cut short by a kill is left out."""
         path = self.folder / "events.jsonl"
-        lines = _bytes(path).split(b"\n")
         events = []
-        for number, line in enumerate(lines[:-1], start=1):
+        for number, line in enumerate(_lines(path), start=1):
+            if number > MOST_EVENTS:
+                raise InputError(f"{path}: more than {MOST_EVENTS} events")
             try:
                 event = json.loads(line)
-                if not math.isfinite(event["time_s"]) or not isinstance(event["kind"], str):
-                    raise TypeError
-            except (ValueError, KeyError, TypeError, RecursionError):
-                raise InputError(f"{path}: line {number} is not an event") from None
+            except (ValueError, RecursionError):
+                event = None
+            if not is_event(event):
+                raise InputError(f"{path}: line {number} is not an event")
             events.append(event)
         return events
 
@@ -145,6 +155,7 @@ class Run:
         for path in files:
             with _parquet(path) as file:
                 try:
+                    check_size(path, file)
                     parts.append(file.read())
                 except (pa.ArrowException, OSError) as error:
                     raise InputError(f"{path}: damaged: {_first_line(error)}") from None
@@ -165,11 +176,42 @@ def _parquet(path: Path) -> pq.ParquetFile:
         raise InputError(f"{path}: not a complete Parquet file: {_first_line(error)}") from None
 
 
+def check_size(path: Path, file: pq.ParquetFile) -> None:
+    """Refuse a table that is small on the disk and enormous in memory: values that repeat take no room in a file.
+
+    Raises
+    ------
+    InputError
+        It is one.
+    """
+    about = file.metadata
+    groups = sum(about.row_group(k).total_byte_size for k in range(about.num_row_groups))
+    size = max(8 * about.num_rows * about.num_columns, groups)
+    if size > max(TABLE_BYTES, TIMES * path.stat().st_size):
+        raise InputError(f"{path}: unpacks to {size >> 20} MiB, more than {TIMES} times what it is: not a table of a run")
+
+
 def _bytes(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        with path.open("rb") as file:
+            content = file.read(MOST_BYTES + 1)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from None
+    if len(content) > MOST_BYTES:
+        raise InputError(f"{path}: longer than {MOST_BYTES >> 20} MiB")
+    return content
+
+
+def _lines(path: Path) -> Iterator[bytes]:
+    """The lines of a file; not the last one if it is cut short."""
+    try:
+        with path.open("rb") as file:
+            while (line := file.readline(MOST_BYTES)).endswith(b"\n"):
+                yield line
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from None
+    if len(line) == MOST_BYTES:
+        raise InputError(f"{path}: a line longer than {MOST_BYTES >> 20} MiB")
 
 
 def _json(path: Path) -> Any:

@@ -1,8 +1,11 @@
-"""What must be in the tables of a run folder before anything is computed from them."""
+"""What must be in the files of a run folder before anything is computed from them."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -91,3 +94,79 @@ def _column_rule(name: str, column: pa.ChunkedArray, is_key: bool) -> str | None
     if len(known) and max(abs(ends["min"].as_py()), abs(ends["max"].as_py())) > GREATEST:
         return f"a number is beyond {GREATEST:g}"
     return None
+
+
+def _text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _texts(value: Any) -> bool:
+    return isinstance(value, list) and all(map(_text, value))
+
+
+def _or_nothing(rule: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: value is None or rule(value)
+
+
+def _table(**fields: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, dict) and all(key in value and rule(value[key]) for key, rule in fields.items())
+
+
+def _lists(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(item, list) for item in value)
+
+
+Rules = Mapping[str, Callable[[Any], bool]]
+
+_EXTREME: Rules = {"who": _text, "value": _number, "limit": _number, "time_s": _number}
+
+#: What readers rely on in run.json, where it is there.
+INFO: Rules = {
+    "status": _text, "backend": _text, "scenario_sha256": _text, "seed": _or_nothing(_number), "steps": _count,
+    "wall_time_s": _number,
+    "versions": lambda value: isinstance(value, dict) and all(map(_or_nothing(_text), value.values())),
+    "checks_failed": _texts, "files": _texts, "first_violation": _or_nothing(_table(bound=_text, who=_text, time_s=_number)),
+    "worst": lambda value: isinstance(value, dict) and all(map(_table(**_EXTREME), value.values())),
+    **dict.fromkeys(("violations", "collisions", "overspeeds", "gridlocks", "waited_long", "not_entered"), _count),
+}  # fmt: skip
+
+#: What readers rely on in every event, where it is there.
+ANY_EVENT: Rules = {
+    "train": _text, "edges": _lists, "formations": _lists, "position_m": _number, "edge_m": _number, "track": _text, "edge": _text,
+}  # fmt: skip
+
+#: What an event of a kind must have for its readers.
+EVENTS: Mapping[str, Rules] = {
+    "violation": {"bound": _text, "who": _text, "value": _number},
+    "depart": {"delay_s": _number},
+    "gridlock": {
+        "waits": lambda value: (
+            isinstance(value, list) and all(map(_table(train=_text, other=_or_nothing(_text), place=_text, edge=_text), value))
+        )
+    },
+    "waiting": {"train": _text, "other": _or_nothing(_text), "since_s": _number},
+    "not_entered": {"trains": _texts},
+    "not_followed": {"what": _text},
+    "stop_reached": {"train": _text, "stop": _text},
+    "waypoint": {"train": _text, "stop": _text},
+}
+
+
+def wrong_fields(found: Mapping[str, Any], rules: Rules, needed: bool) -> list[str]:
+    """Names of fields that are not what they must be; with ``needed`` also of those that are missing."""
+    return [key for key, rule in rules.items() if (key in found or needed) and not rule(found.get(key))]
+
+
+def is_event(found: Any) -> bool:
+    """Whether a line of events.jsonl is an event that can be read."""
+    if not (isinstance(found, dict) and _number(found.get("time_s")) and _text(found.get("kind"))):
+        return False
+    return not wrong_fields(found, EVENTS.get(found["kind"], {}), True) and not wrong_fields(found, ANY_EVENT, False)

@@ -35,7 +35,17 @@ def csv_names(path: Path) -> tuple[str, list[str]]:
     separator = next((s for s in ";,\t| " if s in line), ";")
     names = [name.strip().strip('"') for name in line.split(separator)] if line.strip() else []
     _check(path, names)
+    if any(_number(name) for name in names):
+        raise InputError(f"{path}: line 1 = {line[:60]}: a CSV log begins with the names of its columns, these are values")
     return separator, names
+
+
+def _number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _check(path: Path, names: list[str]) -> None:

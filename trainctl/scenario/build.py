@@ -44,8 +44,9 @@ def open_scenario(name: str, overrides: dict[str, Any] | None = None) -> Model:
 
 
 def model_of(
-    scenario: Scenario, file: str, folder: Path, known: Sequence[str] = (), enrolled: tuple[roster.Roster, Path] | None = None
-) -> Model:
+    scenario: Scenario, file: str, folder: Path, known: Sequence[str] = (), enrolled: tuple[roster.Roster, Path] | None = None,
+    beside: Model | None = None,
+) -> Model:  # fmt: skip
     """Everything the loop needs, checked.
 
     Parameters
@@ -60,6 +61,8 @@ def model_of(
         Mistakes found before; what is found here is told together with them.
     enrolled : tuple of Roster and Path, optional
         The trains of ``network.sumocfg`` and their net, where the scenario has taken them over already.
+    beside : Model, optional
+        A run of the same law on the same line, which is then not read again.
 
     Raises
     ------
@@ -91,6 +94,8 @@ def model_of(
             raise InputError([f"{file}: {line}" for line in found])
         scenario, trains, net = anew
         network = roster.chart(trains.rails), None, net
+    elif beside is not None:
+        network = beside.line, beside.spec, beside.net
     else:
         signals_m = partial(law.signals_m, params) if params is not None and hasattr(law, "signals_m") else None
         network = attempt(_network, scenario, folder, signals_m)
@@ -139,7 +144,7 @@ def model_of(
             found += placing.long_enough(model)
         found += placing.steep(model)
         if trains is None and not misplaced:
-            model = replace(model, roster=roster.placed(scenario, network[0]))
+            model = replace(model, roster=roster.placed(scenario, network[0], None if beside is None else beside.rails))
         if model.roster is not None:
             found += can_brake(model) or promise.refusals(model)
     if found:

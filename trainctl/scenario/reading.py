@@ -17,6 +17,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from sumo_net.bounded import short_text
 from trainctl.errors import InputError
 from trainctl.scenario.reference import FORMS
 from trainctl.scenario.tables import Scenario
@@ -80,7 +81,7 @@ def read(name: str, overrides: dict[str, Any] | None = None) -> tuple[dict[str, 
 def _read(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
     """The tables of a file, laid over those of the scenario it extends."""
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = tomllib.loads(short_text(path))
     except (ValueError, RecursionError) as error:  # not TOML, not text, a number of 5000 digits
         raise InputError(f"{path.name}: not a TOML file: {error}") from None
     except OSError as error:

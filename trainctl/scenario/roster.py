@@ -89,8 +89,11 @@ class Roster(NamedTuple):
         return np.where([len(legs) > 1 for legs in self.legs], np.inf, self.arrival)
 
 
-def placed(scenario: Scenario, line: Line) -> Roster:
-    """Trains that stand on a line from the start and run to its end; free of the mistakes ``placing.on_the_line`` finds."""
+def placed(scenario: Scenario, line: Line, rails: Rails | None = None) -> Roster:
+    """Trains that stand on a line from the start and run to its end; free of the mistakes ``placing.on_the_line`` finds.
+
+    ``rails`` are those of the line, where they are known.
+    """
     n = len(scenario.train)
     places = [line.locate(t.track, t.position_m) for t in scenario.train]
     return Roster(
@@ -98,7 +101,8 @@ def placed(scenario: Scenario, line: Line) -> Roster:
         arrival=np.full(n, np.inf), speed=np.array([t.speed_mps for t in scenario.train], float), like=("",) * n,
         top_speed=np.full(n, np.inf), speed_factor=np.ones(n),
         legs=tuple((line.route(t.track, t.position_m),) for t in scenario.train), stops=((),) * n, cooperates=np.ones(n, bool),
-        vclass=("rail",) * n, patience=np.inf, notes=(), signs=(), closings=(), source="", rails=Rails.of(line), placed=True,
+        vclass=("rail",) * n, patience=np.inf, notes=(), signs=(), closings=(), source="", placed=True,
+        rails=Rails.of(line) if rails is None else rails,
     )  # fmt: skip
 
 

@@ -198,16 +198,24 @@ class TrainType(Table):
     braking_n: PerUnit | None = Field(None, description="Maximum braking effort, positive [N]; default unlimited.")
     braking_power_w: PerUnit | None = Field(None, description="Maximum braking power [W]; default unlimited.")
     actuator_rate_per_s: PerUnit = Field(0.0, description="r of the actuator tau' = -r tau + r demand [1/s] (actuated_units).")
+    force_share: Literal["mass", "installed"] | None = Field(
+        None,
+        description="How the units share a train's force where a law tells whole trains an acceleration. mass, the default: each"
+        " carries its own mass, couplers stay at rest; installed: each gives the same part of its traction_n or braking_n (0: a"
+        " trailer), and couplers carry the difference.",
+    )
 
     #: Keys whose list may be one shorter than the units: couplers.
     _couplers = ("coupler_stiffness_n_per_m", "coupler_damping_ns_per_m")
+    #: Keys by which the force of a train is shared out.
+    _shared = ("traction_n", "braking_n")
 
     @model_validator(mode="after")
     def _per_unit(self) -> TrainType:
         wrong = []
         for key in type(self).model_fields:
             value = getattr(self, key)
-            if key == "units" or value is None:
+            if key in ("units", "force_share") or value is None:
                 continue
             if isinstance(value, tuple):
                 lengths = (self.units, self.units - 1) if key in self._couplers else (self.units,)
@@ -218,19 +226,29 @@ class TrainType(Table):
                 wrong.append(f"{key} = {minimum:g}: must be above 0")
             elif key == "rotating_mass_factor" and minimum < 1:
                 wrong.append(f"{key} = {minimum:g}: must be at least 1")
+            elif (
+                self.force_share == "installed" and key in ("traction_n", "braking_n") and minimum == 0 < max(np.atleast_1d(value))
+            ):
+                continue  # a trailer, or a car without brakes
             elif key in ("traction_n", "traction_power_w", "braking_n", "braking_power_w") and minimum <= 0:
                 wrong.append(f"{key} = {minimum:g}: must be above 0 (leave it out for no limit)")
             elif minimum < 0:
                 wrong.append(f"{key} = {minimum:g}: must not be negative")
+        if self.force_share == "installed":
+            wrong += [
+                f"{key}: missing, and force_share = installed goes by it" for key in self._shared if getattr(self, key) is None
+            ]
         if self.units > 1 and min(np.atleast_1d(self.unit_length_m)) <= 0:
             wrong.append("unit_length_m: a train of several units needs lengths above 0")
         if wrong:
             raise ValueError("; ".join(wrong))
         return self
 
-    def per_unit(self, key: str, missing: float = math.inf) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """The key's value for every unit, shape (units,); couplers are padded with 0 behind the last unit."""
+    def per_unit(self, key: str, missing: float = math.inf) -> np.ndarray[Any, np.dtype[Any]]:
+        """The key's value for every unit, shape (units,); couplers padded with 0 behind the last, installed force True."""
         value = getattr(self, key)
+        if key == "force_share":
+            return np.full(self.units, value == "installed")
         if key in self._couplers:
             row = np.zeros(self.units)
             row[: self.units - 1] = value if not isinstance(value, tuple) else value[: self.units - 1]
@@ -393,13 +411,14 @@ class Scenario(Table):
 
     def consists(self) -> Consists:
         """Fixed data of all trains as arrays."""
-        types = [self.train_type[t.type] for t in self.train]
+        types = [t.type for t in self.train]
 
         def rows(key: str) -> Any:
-            return np.concatenate([k.per_unit(key) for k in types])
+            of = {name: self.train_type[name].per_unit(key) for name in set(types)}
+            return np.concatenate([of[name] for name in types])
 
         return Consists(
-            first=np.concatenate([[0], np.cumsum([k.units for k in types])]).astype(np.int64),
+            first=np.concatenate([[0], np.cumsum([self.train_type[name].units for name in types])]).astype(np.int64),
             length=rows("unit_length_m"),
             mass=rows("unit_mass_kg"),
             rotating=rows("rotating_mass_factor"),
@@ -411,6 +430,7 @@ class Scenario(Table):
             braking=rows("braking_n"),
             braking_power=rows("braking_power_w"),
             actuator_rate=rows("actuator_rate_per_s"),
+            installed=rows("force_share"),
         )
 
     def bounds_of_trains(self) -> Bounds:

@@ -11,14 +11,14 @@ from trainctl.errors import LawError
 from trainctl.scenario.model import Model
 from trainctl.signals import POSITION, SPEED, Demand, Disturbed, Floats, Formed, Messages, Trains
 from trainctl.topology import exchange
+from trainctl.topology.exchange import Radio
 
 
 class Control:
     """Sampled laws; continuous ones are evaluated inside the plant's step."""
 
-    def __init__(self, p: Model) -> None:
-        self.p = p
-        self.radio = p.radio
+    def __init__(self, p: Model, radio: Radio) -> None:
+        self.p, self.radio = p, radio
         self.clamps = getattr(p.law, "CLAMPED", False) and not p.plant.CLAMPS  # else the plant does
 
     def initial(self) -> Demand:
@@ -52,18 +52,20 @@ class Control:
         run = self.p.scenario.run
         if self.p.sampled and k % run.held_steps == 0:
             believed = resistance(own)
-            demand, formed, messages, memory = self._evaluated(k, t, own, believed, formed, messages, memory, disturbed)
-            demand = self._clamped(demand, own, believed)
+            demand, formed, messages, memory = self.evaluated(k, t, own, believed, formed, messages, memory, disturbed)
+            self._check(t, demand)
+            demand = self.clamped(demand, own, believed)
         free = np.isnan(commanded)
         if not free.all():
             asked = Demand(np.where(free, demand.acceleration, commanded), demand.saturated & free)
-            demand = self._clamped(asked, own, resistance(own))
+            demand = self.clamped(asked, own, resistance(own))
         return demand, formed, messages, memory
 
-    def _evaluated(
+    def evaluated(
         self, k: int, t: float, own: Floats, resistance: Floats, formed: Formed, messages: Messages, memory: Any,
         disturbed: Disturbed,
     ) -> tuple[Demand, Formed, Messages, Any]:  # fmt: skip
+        """What the law asks for in the step ``k``, as it is; arguments as those of ``step``, ``resistance`` (n,) for ``own``."""
         assert formed.links is not None
         p, law, leading = self.p, self.p.law, own[self.p.leading]
         leader = formed.references.leader(t)
@@ -78,13 +80,15 @@ class Control:
             demand, memory = law.demand(formed.constants, trains, leader, links, messages.heard, memory)
         else:
             demand = law.demand(formed.constants, trains, leader, links, messages.heard)
-        wrong = np.flatnonzero(~np.isfinite(demand.acceleration))
-        if len(wrong):
-            names = ", ".join(p.scenario.ids[i] for i in wrong)
-            raise LawError(f"law {p.scenario.controller.law} gave a number that is not finite for train {names} at {t:g} s")
         return demand, formed._replace(links=links), messages, memory
 
-    def _clamped(self, demand: Demand, own: Floats, resistance: Floats) -> Demand:
+    def _check(self, t: float, demand: Demand) -> None:
+        wrong = np.flatnonzero(~np.isfinite(demand.acceleration))
+        if len(wrong):
+            names = ", ".join(self.p.scenario.ids[i] for i in wrong)
+            raise LawError(f"law {self.p.scenario.controller.law} gave a number that is not finite for train {names} at {t:g} s")
+
+    def clamped(self, demand: Demand, own: Floats, resistance: Floats) -> Demand:
         """Speed and input clamps of a law whose model has them, for trains of units."""
         if not self.clamps:
             return demand

@@ -29,6 +29,7 @@ from trainctl.signals import (
     Scene,
 )
 from trainctl.topology import exchange
+from trainctl.topology.exchange import Radio
 
 #: A law may move a train within a step by so much [m] per second more or less than a held acceleration would.
 WITHIN_M = 0.02
@@ -58,9 +59,9 @@ class Moved(NamedTuple):
     state: State
 
 
-def of(p: Model) -> Points | Units:
-    """The plant of a scenario."""
-    return Units(p) if p.plant.UNITS else Points(p)
+def of(p: Model, radio: Radio) -> Points | Units:
+    """The plant of a scenario; ``radio`` is how units that are controlled in continuous time exchange messages."""
+    return Units(p, radio) if p.plant.UNITS else Points(p)
 
 
 def _slopes(p: Model) -> Floats:
@@ -137,14 +138,13 @@ class Points:
 class Units:
     """Trains of units, integrated jointly with observer and law; a sampled law's acceleration is shared out to them."""
 
-    def __init__(self, p: Model) -> None:
-        self.p = p
+    def __init__(self, p: Model, radio: Radio) -> None:
+        self.p, self.radio = p, radio
         run, top = p.scenario.run, p.scenario.topology
         self.step_s, self.sub_steps = run.step_s, run.sub_steps
         self.h = self.step_s / self.sub_steps
         self.law: Any = shared if p.sampled else p.law
         self.period = top.communication_period_s
-        self.radio = p.radio
         self.gradient = _slopes(p)
         self.moving = cast(UnitPlant, p.plant)
         self.plant = self.moving.constants(

@@ -117,6 +117,10 @@ class Journal:
         numbers = {name: value(call) for name, (value, _, _) in columns.STOPS.items()}
         self.recorder.write("stops", train=[train], stop=self.stops.index(call.stop.name), platform=edge, **numbers)
 
+    def join(self) -> None:
+        """Complete the tables; the segments they are made from stay."""
+        self.recorder.join()
+
     def close(self) -> None:
         """Complete the files."""
         self.recorder.close()

@@ -1,8 +1,9 @@
 """Many runs of one scenario: every combination of settings and seeds, spread over processes by Dask.
 
-A worker runs one simulation at a time in a scratch folder and sends back one row; only the process that asked writes, so the
-workers need no common file system. Each row is appended to ``rows.jsonl`` as it comes, and at the end they are sorted into one
-Parquet file that does not depend on who computed what.
+A worker runs one simulation at a time in a scratch folder and sends back one row, or a block of numeric runs side by side
+(``blocks``) and sends back their columns; only the process that asked writes, so the workers need no common file system. Rows are
+appended to ``rows.jsonl``, blocks become files in ``parts``, as they come; at the end all are sorted into one Parquet file that
+does not depend on who computed what.
 """
 
 from __future__ import annotations
@@ -12,29 +13,40 @@ import itertools
 import json
 import math
 import os
-import tempfile
-import threading
 import time
 import tomllib
 import uuid
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from trainctl.errors import InputError, TrainctlError
+import numpy as np
+
+from sumo_net.bounded import short_text
+from trainctl.errors import InputError
 from trainctl.scenario.reading import examine, find, read, shipped
-from trainctl.studies.results import COUNTS, RESULTS, reasons, wilson, write_results
+from trainctl.studies.blocks import blocks, refusal, simulate_block
+from trainctl.studies.jobs import Batch, Job, job_model, simulate
+from trainctl.studies.results import (
+    RESULTS,
+    Part,
+    joined,
+    part,
+    read_part,
+    reasons,
+    wilson,
+    write_part,
+    write_results,
+)
 
 FORMAT = "trainctl sweep"
-INFO, ROWS, FIGURE = "sweep.json", "rows.jsonl", "summary.png"
+INFO, ROWS, PARTS, FIGURE = "sweep.json", "rows.jsonl", "parts", "summary.png"
 
 #: A run whose worker dies is given to another one; after so many deaths it is taken for the cause.
 MOST_DEATHS = 3
-
-#: libsumo holds one simulation per process, and a worker may have several threads.
-ONE_SIMULATION = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -58,19 +70,6 @@ class SweepPlan:
         return [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
 
 
-class Job(NamedTuple):
-    """One run, complete in itself: a worker needs no file but the line's, if that is not a shipped one."""
-
-    number: int
-    parameters: dict[str, Any]
-    file: str
-    tables: dict[str, Any]
-    folder: str  # where relative paths in the scenario start
-    jitter: dict[str, float]
-    backend: str
-    keep: str | None  # folder for the run folder
-
-
 # What to run
 
 
@@ -82,7 +81,7 @@ def values(text: str) -> tuple[str, list[Any]]:
     try:
         return key, list(tomllib.loads(f"v = [{right}]")["v"])
     except tomllib.TOMLDecodeError:
-        return key, [_value(part) for part in right.split(",")]
+        return key, [_value(piece) for piece in right.split(",")]
 
 
 def _value(text: str) -> Any:
@@ -95,15 +94,15 @@ def _value(text: str) -> Any:
 def seeds(text: str) -> list[int]:
     """``0..99``, ``7`` or ``1,2,5..9``: all these seeds, each once."""
     found: list[int] = []
-    for part in text.split(","):
-        first, dots, last = part.strip().partition("..")
+    for piece in text.split(","):
+        first, dots, last = piece.strip().partition("..")
         try:
             low = int(first)
             high = int(last) if dots else low
         except ValueError:
             raise InputError(f"--seeds {text}: must be like 0..99 or 1,2,5..9") from None
         if low < 0 or high < low:
-            raise InputError(f"--seeds {text}: {part.strip()} is empty or negative")
+            raise InputError(f"--seeds {text}: {piece.strip()} is empty or negative")
         found += range(low, high + 1)
     return list(dict.fromkeys(found))
 
@@ -135,8 +134,8 @@ def ready_made(name: str) -> SweepPlan | None:
             return None
         path = known[name]
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        data = tomllib.loads(short_text(path))
+    except (OSError, ValueError, RecursionError):
         return None  # the scenario's reader says what is wrong
     if "scenario" not in data:
         return None
@@ -153,43 +152,40 @@ def ready_made(name: str) -> SweepPlan | None:
         raise InputError(f"{path.name}: {error}") from None
 
 
-def jobs(plan: SweepPlan, keep: Path | None = None) -> list[Job]:
-    """All runs of a plan, checked as far as that is the same for all of them.
+def batches(plan: SweepPlan, keep: Path | None = None) -> list[Batch]:
+    """All runs of a plan by combination of settings, checked as far as that is the same for all of them.
 
     Raises
     ------
     InputError
         The scenario is wrong whatever the settings, or a setting is wrong in itself.
     """
-    combinations = plan.combinations()
+    together = bool(plan.seeds) and "run.seed" not in plan.settings
+    settings = replace(plan, seeds=plan.seeds[:1]) if together else plan
+    combinations = settings.combinations()
     if not combinations:
         raise InputError("sweep: a setting without values: nothing to run")
     if plan.jitter and not plan.seeds and "run.seed" not in plan.settings:
         raise InputError("--jitter: deviations are random, so the sweep needs --seeds")
-    file = find(plan.scenario)
+    file, seeds = find(plan.scenario), tuple(plan.seeds) if together else ()
     found = []
-    for number, parameters in enumerate(combinations):
+    for k, parameters in enumerate(combinations):
         tables, _ = read(plan.scenario, parameters)
-        found.append(
-            Job(
-                number,
-                parameters,
-                file.name,
-                tables,
-                str(file.resolve().parent),
-                dict(plan.jitter),
-                plan.backend,
-                str(keep) if keep else None,
-            )
-        )
+        job = Job(
+            k * max(len(seeds), 1), parameters, file.name, tables, str(file.resolve().parent), dict(plan.jitter), plan.backend,
+            str(keep) if keep else None,
+        )  # fmt: skip
+        found.append(Batch(job, range(job.number, job.number + max(len(seeds), 1)), seeds))
     refused: list[str] = []
-    for job in {json.dumps({**j.parameters, "run.seed": 0}, default=str, sort_keys=True): j for j in reversed(found)}.values():
-        _, wrong = examine(job.tables)
+    for batch in {
+        json.dumps({**b.job.parameters, "run.seed": 0}, default=str, sort_keys=True): b for b in reversed(found)
+    }.values():
+        _, wrong = examine(batch.job.tables)
         if wrong:
             raise InputError([f"{file.name}: {line}" for line in wrong])
-    for job in found[:20]:  # one combination that can run is enough: others may be what the sweep is to find out
+    for batch in found[:20]:  # one combination that can run is enough: others may be what the sweep is to find out
         try:
-            job_model(job._replace(jitter={}))
+            job_model(batch.job._replace(jitter={}))
         except InputError as error:
             refused = refused or error.mistakes
         else:
@@ -198,66 +194,14 @@ def jobs(plan: SweepPlan, keep: Path | None = None) -> list[Job]:
         raise InputError(refused)
     for key in plan.jitter:
         name = key.partition(".")[2]
-        if any(not isinstance(train.get(name), int | float) for train in found[0].tables.get("train", [])):
+        if any(not isinstance(train.get(name), int | float) for train in found[0].job.tables.get("train", [])):
             raise InputError(f"--jitter {key}: not every [[train]] has a number {name}")
     return found
 
 
-def job_model(job: Job) -> Any:
-    """The run's scenario as arrays, its starts moved by the jitter."""
-    from trainctl.scenario.build import model_of
-
-    tables = {**job.tables, "train": [dict(train) for train in job.tables.get("train", [])]}
-    _move(tables, job.jitter)
-    scenario, found = examine(tables)
-    if scenario is None:
-        raise InputError([f"{job.file}: {line}" for line in found])
-    return model_of(scenario, job.file, Path(job.folder), found)
-
-
-def _move(tables: dict[str, Any], jitter: Mapping[str, float]) -> None:
-    """Add each train's deviation: a function of the seed, the key and the train's id."""
-    import numpy as np
-
-    from trainctl import draws
-
-    ids = [draws.word(str(train["id"])) for train in tables["train"]]
-    for key, width in jitter.items():
-        name = key.partition(".")[2]
-        who = np.column_stack([ids, np.full(len(ids), draws.word(name))])
-        drawn = draws.uniform(int(tables["run"]["seed"]), draws.JITTER, np.zeros(1, np.int64), who)[0]
-        for train, part in zip(tables["train"], drawn.tolist(), strict=True):
-            train[name] = float(train[name] + width * (2.0 * part - 1.0))
-
-
-# One run
-
-
-def simulate(job: Job) -> dict[str, Any]:
-    """Run one job in this process; its row of the dataset, and under ``_wall_s`` what is not part of it. Never raises."""
-    began = time.perf_counter()
-    with ONE_SIMULATION, tempfile.TemporaryDirectory(prefix="trainctl-sweep-", ignore_cleanup_errors=True) as scratch:
-        folder = Path(scratch if job.keep is None else job.keep) / f"{job.number:06d}"
-        outcome: dict[str, Any]
-        try:
-            outcome = _outcome(job, folder)
-        except InputError as error:
-            outcome = {"status": "refused", "failure": "; ".join(error.mistakes)}
-        except Exception as error:  # whatever one run does, the rest goes on
-            name = "" if isinstance(error, TrainctlError) else f"{type(error).__name__}: "
-            outcome = {"status": "failed", "failure": f"{name}{error}".replace(str(folder), folder.name)}
-    return {"run": job.number, "parameters": job.parameters, **outcome, "_wall_s": round(time.perf_counter() - began, 3)}
-
-
-def _outcome(job: Job, folder: Path) -> dict[str, Any]:
-    from trainctl import runner
-    from trainctl.record.folder import plain
-
-    p = job_model(job)
-    done = runner.run(p, folder, job.backend, job.keep is not None)  # type: ignore[arg-type]
-    values = {key: value for key, value in done.metrics.items() if "/" not in key and isinstance(value, int | float)}
-    told = {key: done.info[key] for key in COUNTS}
-    return {"status": "complete", "failure": None, **told, "metrics": plain(values)}
+def jobs(plan: SweepPlan, keep: Path | None = None) -> list[Job]:
+    """All runs of a plan, one by one; see ``batches``."""
+    return [job for batch in batches(plan, keep) for job in batch.each()]
 
 
 # All runs
@@ -310,87 +254,140 @@ def sweep(
     """
     from trainctl.record.folder import held
 
-    todo = jobs(plan, Path(os.path.abspath(out)) / "runs" if keep else None)
-    identity = _identity(plan, todo[0])
+    planned = batches(plan, Path(os.path.abspath(out)) / "runs" if keep else None)
+    identity = _identity(plan, planned[0].job)
     with held(out):
-        rows = _open_folder(out, identity, resume, force)
+        before = _open_folder(out, identity, resume, force)
     with held(out):
-        return _all(plan, out, todo, identity, rows, workers, scheduler, command_line, progress)
+        return _all(plan, out, planned, identity, before, workers, scheduler, command_line, progress)
 
 
 def _all(
-    plan: SweepPlan, out: Path, todo: Sequence[Job], identity: Mapping[str, Any], rows: dict[str, dict[str, Any]],
+    plan: SweepPlan, out: Path, planned: Sequence[Batch], identity: Mapping[str, Any], before: Sequence[Part],
     workers: int | None, scheduler: str | None, command_line: Sequence[str], progress: Callable[[int, int, int], Any] | None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Run what of ``todo`` is not in ``rows`` yet."""
-    known = {_key(job.parameters) for job in todo}
-    rows = {key: row for key, row in rows.items() if key in known and row["status"] != "failed"}
-    info = _about(identity, plan, todo, command_line)
+    """Run what of a plan is not among the results from ``before``."""
+    number = {
+        _key(parameters): k for batch in planned for k, parameters in zip(batch.numbers, batch.parameters(), strict=True)
+    }  # fmt: skip
+    parts = [_good(found, number) for found in before]
+    done = {number[_key(parameters)] for found in parts for parameters in found.parameters}
+    info = _about(identity, plan, len(number), command_line)
     began = time.perf_counter()
     _write_info(out, info)
 
     def ended(status: str) -> dict[str, Any]:
-        ordered = [{**rows[key], "run": job.number} for job in todo if (key := _key(job.parameters)) in rows]
-        frame = write_results(ordered, out / RESULTS)
-        counts = {name: sum(row["status"] == name for row in ordered) for name in ("complete", "failed", "refused")}
-        number = sum(row["status"] == "complete" and row["violations"] > 0 for row in ordered)
+        found = joined(parts)
+        numbers = [number[_key(parameters)] for parameters in found.parameters]
+        found, numbers = found.kept(np.argsort(numbers).tolist()), sorted(numbers)
+        frame = write_results(found, numbers, out / RESULTS)
+        violated = int((found.counts["violations"] > 0).sum())
+        counts = {name: sum(status == name for status in found.status) for name in ("complete", "failed", "refused")}
         complete = counts["complete"]
-        violated = {
-            "runs": number,
-            "of": complete,
-            "share": number / complete if complete else None,
-            "interval_95": wilson(number, complete),
-        }
         if complete:
             from trainctl.figures.sweep import summary
 
-            summary(frame, list(todo[0].parameters), out / FIGURE)
+            summary(frame, list(planned[0].parameters()[0]), out / FIGURE)
         final = {
             **info,
             "status": status,
             **counts,
-            "violated": violated,
-            **{f"with_{name}": sum(bool(row.get(name)) for row in ordered) for name in ("collisions", "gridlocks")},
-            "reasons": reasons(ordered),
+            "violated": {
+                "runs": violated,
+                "of": complete,
+                "share": violated / complete if complete else None,
+                "interval_95": wilson(violated, complete),
+            },
+            **{f"with_{name}": int((found.counts[name] > 0).sum()) for name in ("collisions", "gridlocks")},
+            "reasons": reasons(found, numbers),
+            "alone": dict(Counter(why for why in found.alone if why is not None).most_common()),
             "wall_time_s": round(time.perf_counter() - began, 3),
         }
         _write_info(out, final)
         return final
 
-    missing = [job for job in todo if _key(job.parameters) not in rows]
-    failures, skipped = 0, len(todo) - len(missing)
+    failures, skipped, name = 0, len(done), itertools.count(len(list((out / PARTS).iterdir())))
     try:
+        todo, why = _tasks(planned, done, workers or os.cpu_count() or 1)
         with (out / ROWS).open("a", encoding="utf-8") as lines:
-            for row in _scattered(missing, workers, scheduler) if missing else ():
-                rows[_key(row["parameters"])] = row
-                lines.write(json.dumps(row) + "\n")
-                lines.flush()
-                failures += row["status"] == "failed"
+            for task, result in _scattered(todo, workers, scheduler) if todo else ():
+                if isinstance(task, Batch):
+                    found = result
+                    write_part(found, out / PARTS / f"{next(name):06d}.parquet")
+                else:
+                    found = part([result], [why.get(result["run"])])
+                    lines.write(json.dumps({**result, "_alone": why.get(result["run"])}) + "\n")
+                    lines.flush()
+                parts.append(found)
+                failures += sum(status == "failed" for status in found.status)
                 if progress is not None:
-                    progress(skipped := skipped + 1, len(todo), failures)
+                    progress(skipped := skipped + len(found.status), len(number), failures)
     except BaseException as error:
         ended("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
         raise
     return ended("complete")
 
 
-def _scattered(todo: Sequence[Job], workers: int | None, scheduler: str | None) -> Iterator[dict[str, Any]]:
-    """Rows as they come from the cluster. Dask gives what a dead worker had to another one."""
+def _good(found: Part, number: Mapping[str, int]) -> Part:
+    """What of a part belongs to the plan and need not be done again."""
+    keys = [_key(parameters) for parameters in found.parameters]
+    return found.kept([k for k, key in enumerate(keys) if key in number and found.status[k] != "failed"])
+
+
+def _tasks(planned: Sequence[Batch], done: set[int], workers: int) -> tuple[list[Job | Batch], dict[int, str]]:
+    """What is left to do, as blocks of runs side by side where that can be; else why not, by the number of the run."""
+    todo: list[Job | Batch] = []
+    single: list[Job] = []
+    why: dict[int, str] = {}
+    beside: tuple[Any, Any] = None, None
+    for batch in planned:
+        left = batch.of([k for k, number in enumerate(batch.numbers) if number not in done])
+        if all(number in done for number in left.numbers):
+            continue
+        place = {key: batch.job.tables.get(key) for key in ("network", "controller")}
+        reason, model = refusal(left, beside[1] if beside[0] == place else None)
+        if model is not None:
+            beside = place, model
+        if reason is None and model is not None:
+            todo += blocks(left, model, workers)
+        else:
+            single += left.each()
+            why |= dict.fromkeys(left.numbers, reason) if reason is not None and batch.job.backend == "numeric" else {}
+    return [*todo, *single], why
+
+
+def _done(task: Job | Batch) -> dict[str, Any] | Part:
+    """What a worker does: a row of a single run, or the results of a block."""
+    return simulate(task) if isinstance(task, Job) else simulate_block(task)
+
+
+def _failed(task: Job | Batch, reason: str) -> dict[str, Any] | Part:
+    """What is left of a task whose worker could not do it."""
+    rows = [
+        {"run": job.number, "parameters": job.parameters, "status": "failed", "failure": reason}
+        for job in ([task] if isinstance(task, Job) else task.each())
+    ]
+    return rows[0] if isinstance(task, Job) else part(rows)
+
+
+def _scattered(todo: Sequence[Job | Batch], workers: int | None, scheduler: str | None) -> Iterator[tuple[Job | Batch, Any]]:
+    """Tasks and what they gave, as it comes from the cluster. Dask gives what a dead worker had to another one."""
     from distributed import as_completed
 
     with _client(min(workers or os.cpu_count() or 1, len(todo)), scheduler) as client:
         once = uuid.uuid4().hex
-        futures = client.map(simulate, todo, key=[f"trainctl-{once}-{job.number}" for job in todo], pure=False)
-        whose = {future.key: job for future, job in zip(futures, todo, strict=True)}
+        futures = client.map(_done, todo, key=[f"trainctl-{once}-{k}" for k in range(len(todo))], pure=False)
+        whose = {future.key: task for future, task in zip(futures, todo, strict=True)}
         try:
             for future in as_completed(futures, loop=client.loop):  # type: ignore[no-untyped-call]
-                job, error = whose[future.key], future.exception()
+                task, error = whose[future.key], future.exception()
                 if error is None:
-                    yield future.result()
+                    yield task, future.result()
                 else:
                     died = type(error).__name__ == "KilledWorker"
                     reason = f"its worker died {MOST_DEATHS} times" if died else f"{type(error).__name__}: {error}"
-                    yield {"run": job.number, "parameters": job.parameters, "status": "failed", "failure": reason}
+                    yield task, _failed(task, reason)
+                future.release()
         finally:
             client.cancel(futures, force=True)
 
@@ -437,12 +434,12 @@ def _identity(plan: SweepPlan, first: Job) -> dict[str, Any]:
     return {"scenario": first.file, "scenario_sha256": digest, "jitter": dict(plan.jitter), "backend": plan.backend}
 
 
-def _about(identity: Mapping[str, Any], plan: SweepPlan, todo: Sequence[Job], command_line: Sequence[str]) -> dict[str, Any]:
+def _about(identity: Mapping[str, Any], plan: SweepPlan, runs: int, command_line: Sequence[str]) -> dict[str, Any]:
     from trainctl.record.folder import SCHEMA_VERSION, installed
 
     return {
         "format": FORMAT, "schema_version": SCHEMA_VERSION, "status": "running", **identity,
-        "set": {key: list(values) for key, values in plan.settings.items()}, "seeds": list(plan.seeds), "runs": len(todo),
+        "set": {key: list(values) for key, values in plan.settings.items()}, "seeds": list(plan.seeds), "runs": runs,
         "versions": {name: installed(p) for name, p in (("trainctl", "trainctl"), ("sumo", "libsumo"), ("dask", "dask"))},
         "command_line": list(command_line),
     }  # fmt: skip
@@ -454,8 +451,8 @@ def _write_info(out: Path, info: Mapping[str, Any]) -> None:
     write_json(out / INFO, info)
 
 
-def _open_folder(out: Path, identity: Mapping[str, Any], resume: bool, force: bool) -> dict[str, dict[str, Any]]:
-    """Make the folder ready; rows that are there already, by their parameters."""
+def _open_folder(out: Path, identity: Mapping[str, Any], resume: bool, force: bool) -> list[Part]:
+    """Make the folder ready; the results that are there already."""
     from trainctl.record.folder import free, remove
 
     try:
@@ -467,7 +464,8 @@ def _open_folder(out: Path, identity: Mapping[str, Any], resume: bool, force: bo
         other = [key for key, value in identity.items() if info.get(key) != value]
         if other:
             raise InputError([f"{out}: --resume: its {key} is {info.get(key)}, now it is {identity[key]}" for key in other])
-        return _rows(out / ROWS)
+        (out / PARTS).mkdir(exist_ok=True)
+        return [*_rows(out / ROWS), *map(read_part, sorted((out / PARTS).glob("*.parquet")))]
     if not (free(out) or force):
         hint = "--resume goes on with it, --force replaces it" if ours else "choose another --out, or --force to replace it"
         raise InputError(f"{out}: {'holds a sweep' if ours else 'exists and is not a sweep of trainctl'}: {hint}")
@@ -475,16 +473,16 @@ def _open_folder(out: Path, identity: Mapping[str, Any], resume: bool, force: bo
         raise InputError(f"{out}: holds the current directory: choose another --out")
     try:
         remove(out)
-        out.mkdir(parents=True)
+        (out / PARTS).mkdir(parents=True)
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror}") from None
-    return {}
+    return []
 
 
-def _rows(path: Path) -> dict[str, dict[str, Any]]:
-    """What was done; the last line may have been cut by a kill, and is dropped, so that the next one begins afresh."""
+def _rows(path: Path) -> list[Part]:
+    """What was done run by run; the last line may have been cut by a kill, and is dropped, so that the next one begins afresh."""
     if not path.is_file():
-        return {}
+        return []
     found, good = {}, []
     for line in path.read_text(encoding="utf-8").splitlines():
         try:
@@ -494,4 +492,4 @@ def _rows(path: Path) -> dict[str, dict[str, Any]]:
         except (ValueError, KeyError, TypeError):
             continue
     path.write_text("".join(f"{line}\n" for line in good), encoding="utf-8")
-    return found
+    return [part(list(found.values()), [row.get("_alone") for row in found.values()])]

@@ -49,7 +49,7 @@ def message(constants: Params, own: Trains, leader: Floats) -> Floats:
 def demand(constants: Params, own: Trains, leader: Floats, links: Links, heard: Floats) -> Demand:
     """The law: acceleration of every train [m/s2] from its own state and what its links brought last (L, 2)."""
     i = links.receiver
-    e = heard[:, 0] - (own.position[i] - leader[0]) - links.desired
+    e = heard[:, 0] - (own.position - leader[0])[i] - links.desired
     said = heard[:, 1] > 0.0  # nothing has come yet: the error is not known
     differ = constants.k_per_s * np.bincount(i, np.where(said, e, 0.0), minlength=len(own.speed))
     wanted = leader[1] + np.clip(differ, -constants.slower_mps, constants.faster_mps)

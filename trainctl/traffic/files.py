@@ -8,10 +8,11 @@ import re
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
+from sumo_net import bounded
 from trainctl.errors import InputError
 
 #: What SUMO calls one thing: the places a train can stop at.
@@ -42,14 +43,42 @@ class Elements(NamedTuple):
     late: list[Element]  # trains behind later ones in a route file, which SUMO passes over
 
 
+#: Elements within elements; SUMO's files have up to five.
+DEEPEST = 50
+
+
+class _Refused(Exception):
+    """XML that no file of SUMO has."""
+
+
+class _Shallow(ElementTree.TreeBuilder):
+    """Builds the tree of a file without a document type and without deep nesting."""
+
+    depth = 0
+
+    def start(self, tag: Any, attributes: Any, /) -> Element:
+        self.depth += 1
+        if self.depth > DEEPEST:
+            raise _Refused(f"has more than {DEEPEST} elements within each other")
+        return super().start(tag, attributes)
+
+    def end(self, tag: Any, /) -> Element:
+        self.depth -= 1
+        return super().end(tag)
+
+    def doctype(self, *_: object) -> None:
+        raise _Refused("declares a document type")
+
+
 def parse(path: Path) -> Element:
     """Root of an XML file, which may be compressed."""
     try:
-        content = path.read_bytes()
-        content = gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content
-        if b"<!DOCTYPE" in content:
-            raise InputError(f"{path}: declares a document type, which a SUMO file does not")
-        return ElementTree.fromstring(content)
+        parser = ElementTree.XMLParser(target=_Shallow())
+        parser.feed(bounded.content(path))
+        root: Element = parser.close()
+        return root
+    except (_Refused, bounded.TooLong) as error:
+        raise InputError(f"{path}: {error}, which a SUMO file does not") from None
     except gzip.BadGzipFile as error:
         raise InputError(f"{path}: not XML: {error}") from None
     except OSError as error:

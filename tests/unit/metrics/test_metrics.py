@@ -199,7 +199,9 @@ def test_gap_is_negative_where_trains_overlap(ahead: float, told: list[float], e
     """In a row, and between two rows, where only the event knows."""
     tables = three_trains()
     tables["trains"]["gap_m"] = tables["trains"]["gap_m"] - ahead
-    events = [{"kind": "violation", "time_s": 1.5, "bound": "gap_m", "trains": ["1", "2"], "value": value} for value in told]
+    events = [
+        {"kind": "violation", "time_s": 1.5, "bound": "gap_m", "who": "1-2", "trains": ["1", "2"], "value": value} for value in told
+    ]
     assert metrics(run_folder(tmp_path, tables, scenario(), events))["traffic.gap_min_m"] == expected
 
 
@@ -368,6 +370,9 @@ BOMB = '<!DOCTYPE x [<!ENTITY a "lol"><!ENTITY b "&a;&a;&a;">]><fcd-export><time
         (b'<fcd-export><timestep time="0"><vehicle id="a"/></timestep></fcd-export>', "without id or speed"),
         (b'<?xml version="1.0" encoding="nonsense"?><fcd-export/>', "nonsense|unknown encoding"),
         (CSV.replace("120", "much").encode(), "pos = much: not a number"),
+        (CSV.replace("2.00;a", "2.00;a;10;110;e_0\n2.00;a").encode(), "vehicle a stands twice at 2 s"),
+        (FCD.replace('id="c"', 'id="b"').encode(), "vehicle b stands twice at 2 s"),
+        (CSV.partition("\n")[2].encode(), "line 1 = 0.00;a;10;100;e_0: a CSV log begins with the names of its columns"),
         (b"timestep_time;vehicle_id;vehicle_speed\n0;a\xff;1\n", "not a CSV log"),
     ],
 )

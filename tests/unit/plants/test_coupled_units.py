@@ -260,3 +260,52 @@ def test_unbounded_speed_leaves_nothing_to_say() -> None:
     one = np.ones(1)
     assert [bound.tolist() for bound in coupled_units.room(train(), -np.inf * one, np.inf * one)] == [[-np.inf], [np.inf]]
     assert shared.smallest_period(train(), 80.0 * one, 79.0 * one, np.inf * one).tolist() == [np.inf]
+
+
+def motor_cars(**more: object) -> Consists:
+    """Motor car, two trailers, motor car; brakes in every car, half as strong in the trailers."""
+    ends = np.array([80e3, 0.0, 0.0, 80e3])
+    return train()._replace(
+        traction=ends,
+        traction_power=4.8e6 * np.ones(4),
+        braking=np.array([60e3, 30e3, 30e3, 60e3]),
+        installed=np.ones(4, bool),
+        **more,
+    )
+
+
+def demanded(consists: Consists, own: Floats, acceleration: float) -> Floats:
+    constants, out = shared.constants(Params(), consists), np.full(len(own), np.nan)
+    constants.acceleration[:] = acceleration
+    nothing = np.zeros((0, 0))
+    shared.demand(0, constants, np.zeros(4), 0.0, 0.0, own, nothing, nothing, np.zeros(0), nothing, out)
+    return out
+
+
+@pytest.mark.parametrize("acceleration", [0.2, -0.1, -0.5])
+def test_by_installed_force_each_unit_gives_the_same_part_of_what_it_has(acceleration: float) -> None:
+    consists = motor_cars()
+    own = at(consists, 70.0)
+    own[1, 0] += 0.03  # couplers that carry load change nothing: there are no pairs of forces
+    force = demanded(consists, own, acceleration)
+    r = DAVIS[0] + DAVIS[1] * 70.0 + DAVIS[2] * 70.0**2
+    assert force.sum() == pytest.approx(consists.mass.sum() * (acceleration + r))
+    parts = [0.5, 0.0, 0.0, 0.5] if acceleration + r > 0 else [1 / 3, 1 / 6, 1 / 6, 1 / 3]
+    assert force / force.sum() == pytest.approx(parts)
+    assert demanded(consists._replace(installed=np.zeros(4, bool)), at(consists, 70.0), acceleration) == pytest.approx(
+        consists.mass * (acceleration + r)
+    )  # by mass
+
+
+def test_by_installed_force_a_train_gives_all_that_it_has() -> None:
+    consists, band = motor_cars(), (np.array([60.0]), np.array([80.0]))
+    low, high = coupled_units.room(consists, *band)
+    assert high == pytest.approx(2 * 4.8e6 / 80.0 / 320e3)
+    assert low == pytest.approx(-180e3 / 320e3)
+    by_mass = coupled_units.room(consists._replace(installed=np.zeros(0, bool)), *band)
+    assert by_mass[0] == pytest.approx(-30.0 / 80.0) and by_mass[1] < 0.1  # the weakest unit decides
+    relied = [
+        float(coupled_units.relied_on(Params(), c, (), ("1",), b, np.array([80.0]), np.zeros(1), 3.0).braking[0])
+        for c in (consists, consists._replace(installed=np.zeros(0, bool))) for b in (0.3, 0.5, 0.9)
+    ]  # fmt: skip
+    assert relied == pytest.approx([0.3, 0.5, 180e3 / 320e3, 0.3, (2 * 40e3 + 2 * 30e3) / 320e3, 180e3 / 320e3])

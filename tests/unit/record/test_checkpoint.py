@@ -297,11 +297,11 @@ def test_a_folder_knows_its_scenario_and_network(own_line, tmp_path):
     prepared = open_scenario("three_tracks", settings)
     partial = open_partial(tmp_path / "run")
     (partial / "scenario.toml").write_text(prepared.scenario.toml())
-    begin(partial, prepared, 2.0)
+    begin(partial, prepared, 2.0, {"seed": 7})
     if own_line:
         path.unlink()
-    found, every = again(partial)
-    assert every == 2.0
+    found, every, info = again(partial)
+    assert (every, info) == (2.0, {"seed": 7})
     assert found.scenario.toml() == prepared.scenario.toml()
     assert checkpoint.identity(found) == checkpoint.identity(prepared)
 

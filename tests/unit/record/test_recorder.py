@@ -128,7 +128,7 @@ here.record(pathlib.Path({str(killed)!r}), steps=40, cuts=(20,))
     shutil.copytree(killed, tmp_path / "copy")
     with Recorder(tmp_path / "copy", TABLES, resume=position):  # what was recorded after the cut is gone at once
         left = {path.name for path in (tmp_path / "copy" / "segments").iterdir()}
-        assert left == {f"{name}-{k:05d}.parquet" for name, count in position["segments"].items() for k in range(count)}
+        assert left == {f"{name}-{k:05d}.parquet" for name, sums in position["segments"].items() for k in range(len(sums))}
     record(killed, start=21, resume=position)
     assert contents(killed) == contents(tmp_path / "whole")
 

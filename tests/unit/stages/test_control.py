@@ -106,7 +106,7 @@ def test_a_number_that_is_not_finite_ends_the_run(monkeypatch):
 
 def test_a_continuous_law_is_not_asked_here():
     p = open_scenario("emu_finite_time")
-    control = Control(p)
+    control = Control(p, p.radio)
     demand = control.initial()
     same = control.step(0, 0.0, p.own, None, None, None, demand, (), np.full(len(p.scenario.ids), np.nan), None)
     assert same == (demand, None, None, ())

@@ -24,10 +24,25 @@ def alone(monkeypatch):
 
     def here(todo, workers, scheduler):
         asked.append([job.number for job in todo])
-        yield from map(sweeping.simulate, reversed(todo))
+        yield from ((job, sweeping.simulate(job)) for job in reversed(todo))
 
     monkeypatch.setattr(sweeping, "_scattered", here)
     return asked
+
+
+@pytest.fixture
+def here(monkeypatch):
+    """The cluster is this process; the last task comes first, and after so many of them it is interrupted."""
+    after = [1000]
+
+    def scattered(todo, workers, scheduler):
+        for task in [*reversed(todo)][: after[0]]:
+            yield task, sweeping._done(task)
+        if len(todo) > after[0]:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(sweeping, "_scattered", scattered)
+    return after
 
 
 @pytest.mark.parametrize(
@@ -204,3 +219,66 @@ def test_two_sweeps_do_not_write_into_one_folder(tmp_path):
         with held(out), pytest.raises(InputError, match="another process is writing there"):
             sweep(plan, out, **more)
     assert list(out.iterdir()) == []
+
+
+MANY = SweepPlan(
+    str(sweeping.sweeps()["monte_carlo_start"]), {**SHORT, "topology.loss": [0.0, 0.2]}, range(13), {"train.position_m": 500.0},
+    "numeric",
+)  # fmt: skip
+
+
+def test_runs_side_by_side_give_one_dataset_however_they_are_cut_and_resumed(here, tmp_path):
+    info = sweep(MANY, tmp_path / "whole", workers=1)
+    assert (info["complete"], info["refused"], info["alone"]) == (26, 0, {})
+    whole = (tmp_path / "whole" / "results.parquet").read_bytes()
+    assert len(list((tmp_path / "whole" / "parts").iterdir())) > 2
+    here[0] = 3
+    with pytest.raises(KeyboardInterrupt):
+        sweep(MANY, tmp_path / "cut", workers=4)
+    kept = len(pd.read_parquet(tmp_path / "cut" / "results.parquet"))
+    assert 0 < kept < 26
+    here[0] = 1000
+    told = []
+    assert sweep(MANY, tmp_path / "cut", resume=True, progress=lambda *numbers: told.append(numbers))["complete"] == 26
+    assert told[0][0] > kept
+    assert (tmp_path / "cut" / "results.parquet").read_bytes() == whole
+
+
+def test_runs_side_by_side_give_the_dataset_of_single_ones(here, tmp_path, monkeypatch):
+    sweep(MANY, tmp_path / "many")
+    monkeypatch.setattr("trainctl.studies.blocks.SMALLEST", 100)
+    info = sweep(MANY, tmp_path / "single")
+    assert info["alone"] == {"fewer than 100 runs differ in their seeds alone": 26}
+    many, single = (pd.read_parquet(tmp_path / name / "results.parquet") for name in ("many", "single"))
+    assert list(many.columns) == list(single.columns)
+    sums = [c for c in many.columns if any(part in c for part in ("l2_gain", "energy.", "jerk_rms", "_mean_"))]
+    pd.testing.assert_frame_equal(many.drop(columns=sums), single.drop(columns=sums), check_exact=True)
+    pd.testing.assert_frame_equal(many[sums], single[sums], rtol=1e-12, atol=0.0)
+
+
+def test_runs_that_cannot_go_side_by_side_run_one_by_one_and_it_is_said(here, tmp_path):
+    """A start that is refused, orders on the way, tables that are to be kept."""
+    wild = SweepPlan("fully_distributed", SHORT, range(12), {"train.position_m": 3000.0}, "numeric")
+    info = sweep(wild, tmp_path / "wild")
+    assert info["refused"] == info["alone"]["its start is refused"] > 0
+    assert info["complete"] == 12 - info["refused"]
+    late = [{"kind": "reroute", "train": 2, "crossover": "leave", "time_s": 9.0}]
+    ordered = SweepPlan("fully_distributed", {**SHORT, "event": [late]}, range(10), {}, "numeric")
+    assert sweep(ordered, tmp_path / "ordered")["alone"] == {"it has events on the way": 10}
+    assert sweep(MANY, tmp_path / "kept", keep=True)["alone"] == {"--keep asks for its tables": 26}
+
+
+def test_a_law_that_takes_one_run_alone_gets_them_one_by_one(here, tmp_path, monkeypatch):
+    from trainctl.controllers import fully_distributed
+
+    whole = fully_distributed.constants
+
+    def one_only(params, scene):
+        if len(scene.trains) > 6:
+            raise ValueError("six trains are the most")
+        return whole(params, scene)
+
+    monkeypatch.setattr(fully_distributed, "constants", one_only)
+    info = sweep(SweepPlan("fully_distributed", SHORT, range(20), {}, "numeric"), tmp_path / "a", workers=1)
+    assert info["complete"] == 20
+    assert info["alone"] == {"ValueError: six trains are the most": 20}
