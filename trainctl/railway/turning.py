@@ -3,7 +3,8 @@
 A train turns where its route goes over into the other direction of the track it is on. It stands then, with all of itself on track
 that its next leg runs back over, edge by edge; its rear becomes its front, see ``ways.turned``. As in SUMO 1.28 the next leg must
 have as many normal edges as there are edges under the train, those inside junctions too, and the rear must not stand inside a
-junction: SUMO puts such a train somewhere else.
+junction: SUMO puts such a train somewhere else. It puts a train that reaches over junctions farther by their length; to make up for
+that the train is told to go on by as much before it turns, so there must be room for it.
 """
 
 from __future__ import annotations
@@ -18,6 +19,9 @@ from trainctl.signals import Bools, Floats, Ints
 
 #: A train that turns stands at least this far before the end of its edge [m]; nearer than 0.1 m SUMO would let it arrive.
 SHORT_M = 0.2
+
+#: Room that is left beyond what a train goes on by before it turns [m].
+SPARE_M = 0.01
 
 #: Rounding in positions [m].
 ROUNDING_M = 1e-6
@@ -66,6 +70,13 @@ def legs(edges: Sequence[int], reversal: Collection[tuple[int, int]]) -> list[li
     return found
 
 
+def inside(onward: Ints, front: float, internal: Bools, length_m: Floats) -> float:
+    """Length of the junctions under a train that has turned [m]: its front is ``front`` [m] from the beginning of its new way."""
+    begin = np.concatenate([[0.0], np.cumsum(length_m[onward])])
+    behind = onward[: int(np.searchsorted(begin[1:-1], front, side="left"))]
+    return float(length_m[behind[internal[behind]]].sum())
+
+
 def yard(leg: Ints, begin: Floats, onward: Ints, twin: Ints, internal: Bools, length_m: Floats, length: float) -> Yard:
     """Where a train may turn.
 
@@ -91,7 +102,9 @@ def yard(leg: Ints, begin: Floats, onward: Ints, twin: Ints, internal: Bools, le
     for k in range(len(leg) - common, len(leg)):
         if internal[leg[k]]:
             continue
-        first = float(begin[k]) + length
-        if first <= end:
-            found.append((first, min(float(begin[k] + length_m[leg[k]]) + length - ROUNDING_M, end)))
+        inside = float(length_m[leg[k:]][internal[leg[k:]]].sum())
+        first, last = max(float(begin[k]) + length, float(begin[-1]) + SPARE_M), float(begin[k] + length_m[leg[k]]) + length
+        last = min(last - (inside + SPARE_M if inside else ROUNDING_M), end + SHORT_M - max(inside + SPARE_M, SHORT_M))
+        if first <= last:
+            found.append((first, last))
     return Yard(np.array(found).reshape(-1, 2))

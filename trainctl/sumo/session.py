@@ -11,8 +11,7 @@ import os
 import re
 import sys
 from collections import deque
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -23,10 +22,12 @@ import numpy as np
 from sumo_net import Line
 from trainctl.errors import CouplingError, SimulatorError
 from trainctl.numeric import LEAVES_M, lay_out, way_lengths
+from trainctl.railway.turning import inside
 from trainctl.railway.ways import Ways, rerouted, turned
 from trainctl.runs.sumo_logs import elements
 from trainctl.signals import Bools, Floats, Ints, Links, Seen, Start
 from trainctl.sumo.causes import SPEED_MODE_FREE, cause
+from trainctl.sumo.idling import OF_IDLING, idle_s, silent
 from trainctl.sumo.preflight import objections
 
 #: What SUMO adds in one step is exact to rounding; anything beyond was somebody else.
@@ -35,21 +36,15 @@ TOLERANCE_M = 1e-6
 #: Closer than this to the end of its edge a train may be on the next one.
 NEAR_M = 1e-3
 
-#: SUMO's driver decides that often [s]: never, but where it is told to. Every train is commanded in every step, so all it decides
-#: is overruled, and it takes half of SUMO's time. Only its way over the end of an edge has to be planned.
-IDLE_S = 1e6
-
 #: Closer than this to the end of its edge, or beyond, SUMO plans the step.
 PLANNED_M = 1.0
 
 #: A stop that a train parks at, until it is told to resume: its time [s], and the flag that says so.
 PARKS_S, PARKING = 1e6, 1
 
-#: SUMO puts a train that turns so far beyond its place [m]; told to go as far before it turns, it stands where it should.
+#: SUMO puts a train that turns so far beyond its place [m], and by the junctions under it; told to go as far before it turns, it
+#: stands where it should.
 TURNS_M = 1e-3
-
-#: What SUMO says about drivers who decide so rarely.
-OF_IDLING = ("Warning: Given action step length", "Warning: Action step length")
 
 OPTIONS = {
     "time-to-teleport": "-1",  # a train held at speed 0 would teleport after 300 s
@@ -241,7 +236,7 @@ class Session:
 class Sumo(Session):
     """SUMO behind the loop: trains move by what they are told."""
 
-    idle = True  # see IDLE_S
+    idle = True  # see ``idling``
 
     def start(self, start: Start) -> None:
         """Load the net, insert the trains, verify each of them, and take every speed correction off."""
@@ -390,7 +385,8 @@ class Sumo(Session):
         wanted = np.where(present, before + displacement, before)
         left = self.ways.begin[row] + self.line.length_m[self.ways.edge[row]] - wanted
         speeds = displacement / step
-        speeds[[i for i, _, _ in self.turning]] = TURNS_M / step
+        for train, edges, _ in self.turning:
+            speeds[train] = (TURNS_M + self._inside(train, edges)) / step
         self._call(self._command, np.flatnonzero(present), speeds)
         if self.idle:
             for i in np.flatnonzero(present & (left < PLANNED_M)).tolist():
@@ -414,6 +410,13 @@ class Sumo(Session):
             now.present[trains] = True
             self.coming.clear()
         self.seen = now
+
+    def _inside(self, train: int, edges: tuple[str, ...]) -> float:
+        """Length of the junctions under a train once it has turned [m]."""
+        size, row = self.line.length_m, int(self.seen.row[train])
+        front = float(self.ways.begin[row] + size[self.ways.edge[row]] - self.seen.position[train] + self.length[train])
+        numbers, within = [self.line.index[edge] for edge in edges], [edge.startswith(":") for edge in self.line.edges]
+        return inside(np.array(numbers, np.int64), front, np.array(within), size)
 
     def _turned(self, train: int, edges: tuple[str, ...], arrival: float) -> tuple[float, float]:
         """Take over the way of a train that has turned: where its front should be now, and how far that is from its edge's end."""
@@ -469,24 +472,6 @@ def _direct(function: Any) -> Any:
     """Find the compiled function that a function of libsumo hands its arguments on to: handing on takes a third of a call."""
     compiled = getattr(sys.modules.get(function.__module__), "_libsumo", None)
     return getattr(compiled, f"vehicle_{function.__name__}", function)
-
-
-def idle_s(step: float) -> float:
-    """``IDLE_S`` in whole steps of the simulator: SUMO rounds anything else, and says so."""
-    return round(math.ceil(IDLE_S / step) * step, 3)
-
-
-@contextmanager
-def silent() -> Iterator[None]:
-    """What libsumo prints on stderr meanwhile goes nowhere; it stands in SUMO's message log, too."""
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
 
 
 def _ended(path: Path) -> bool:
