@@ -9,7 +9,7 @@ import copy
 import math
 import random
 import subprocess
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -74,11 +74,14 @@ LAWS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-def net(folder: Path, nodes: Mapping[str, tuple[float, float]], edges: Mapping[str, Any], *options: str) -> None:
-    """Write ``a.net.xml``: nodes are (x, y), edges (from, to) or (from, to, further attributes)."""
+def net(
+    folder: Path, nodes: Mapping[str, tuple[float, float]], edges: Mapping[str, Any], *options: str, signals: Collection[str] = ()
+) -> None:
+    """Write ``a.net.xml``: nodes are (x, y), edges (from, to) or (from, to, further attributes); rail signals stand at ``signals``."""
     folder.mkdir(parents=True, exist_ok=True)
+    kind = {n: ' type="rail_signal"' if n in signals else "" for n in nodes}
     (folder / "a.nod.xml").write_text(
-        "<nodes>" + "".join(f'<node id="{n}" x="{x}" y="{y}"/>' for n, (x, y) in nodes.items()) + "</nodes>"
+        "<nodes>" + "".join(f'<node id="{n}" x="{x}" y="{y}"{kind[n]}/>' for n, (x, y) in nodes.items()) + "</nodes>"
     )
     rows = []
     for name, (begin, end, *more) in edges.items():
@@ -216,7 +219,7 @@ def three_joins(folder: Path) -> None:
     )
 
 
-def single_track(folder: Path, body: str) -> None:
+def single_track(folder: Path, body: str, signals: Collection[str] = ()) -> None:
     """Single track from ``a`` to ``b`` with two passing loops: ``UP`` and ``DOWN`` are the ways."""
     loops = {}
     for k, (begin, x) in enumerate((("1", 6000), ("3", 14000)), 1):
@@ -228,6 +231,7 @@ def single_track(folder: Path, body: str) -> None:
         folder,
         {"a": (0, 0), "1": (6000, 0), "2": (8000, 0), "3": (14000, 0), "4": (16000, 0), "b": (22000, 0)},
         {**both_ways("left", "a", "1"), **both_ways("middle", "2", "3"), **both_ways("right", "4", "b"), **loops},
+        signals=signals,
     )
     traffic(folder, body)
 

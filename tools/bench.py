@@ -21,7 +21,7 @@ traffic            numeric: trains that come from two lines each, form up where 
 =================  ===============================================================================================================
 
 The net is fixed: three parallel tracks cut into edges of 5 km, ``bench_three_tracks``, as long as the trains need. The outputs of
-SUMO are those of a run (``trainctl.sumo.session.OPTIONS``) in all cases with SUMO. A figure is the time from the first step
+SUMO are those of a run (``trainctl.sumo.commanded_files.OPTIONS``) in all cases with SUMO. A figure is the time from the first step
 until the logs are closed, per train and step [us]; ``peak_mb`` is the peak resident memory of the process that steps. Time of the
 processor is told too (``cpu_``, all threads): where others use the machine it is the truer figure.
 
@@ -324,7 +324,7 @@ def inputs(folder: Path, case: str, trains: int, steps: int) -> None:
     from trainctl.numeric import Numeric
     from trainctl.scenario.build import open_scenario
     from trainctl.stages.record import Journal
-    from trainctl.sumo.session import LOGS, write_configuration, write_routes
+    from trainctl.sumo.commanded_files import LOGS, write_configuration, write_routes
 
     model = open_scenario(str(folder / "scenario.toml"))
     sumo_net.build(model.spec, folder)

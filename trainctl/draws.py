@@ -18,7 +18,7 @@ from numba import njit
 from trainctl.signals import Floats, Ints
 
 #: What numbers are for: the second word of the counter. Disturbances, with steps of up to 64 bits, have 0.
-DISTURBANCE, NOISE, LOSS, JITTER, DEPARTURE, REROUTER = range(6)
+DISTURBANCE, NOISE, LOSS, JITTER, DEPARTURE, REROUTER, BURST = range(7)
 
 WORD = 0xFFFFFFFF
 

@@ -20,6 +20,21 @@ def visible(text: str) -> str:
     return text.translate(STEERING)
 
 
+#: Packages a light install leaves out (tools/light.txt), and what needs them.
+LEFT_OUT = {
+    "libsumo": "SUMO", "sumo": "SUMO", "traci": "SUMO", "sumolib": "SUMO", "matplotlib": "figures", "plotly": "pages",
+    "dask": "sweeps", "distributed": "sweeps",
+}  # fmt: skip
+
+
+def left_out(module: str) -> str:
+    """What is to be said where a module is missing that a light install leaves out; "" for any other."""
+    package = module.partition(".")[0]
+    if package not in LEFT_OUT:
+        return ""
+    return f"{LEFT_OUT[package]}: {package} is not installed; `pip install trainctl` has it, this light install does not"
+
+
 class TrainctlError(Exception):
     """Base of all errors this package raises on purpose."""
 

@@ -10,6 +10,7 @@ import hashlib
 import os
 import tempfile
 import warnings
+from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -64,9 +65,12 @@ def _base() -> Path:
 
 
 def keep_by_sources() -> None:
-    """Point numba's cache at a folder of this version of the sources, unless NUMBA_CACHE_DIR says otherwise."""
-    if os.environ.get("NUMBA_CACHE_DIR"):
-        return
+    """Point numba's cache at a folder of this version of the sources, unless NUMBA_CACHE_DIR names one that can be written."""
+    if given := os.environ.get("NUMBA_CACHE_DIR"):
+        with suppress(OSError):
+            Path(given).mkdir(parents=True, exist_ok=True)
+        if os.access(given, os.W_OK | os.X_OK):
+            return
     here = Path(__file__).parent
     digest = hashlib.sha256(numba.__version__.encode())
     compiled = [p for part in ("plants", "controllers", "observers", "topology", "railway") for p in (here / part).glob("*.py")]

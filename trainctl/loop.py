@@ -18,7 +18,7 @@ from trainctl.railway.ways import under
 from trainctl.scenario.events import Event
 from trainctl.scenario.model import Model
 from trainctl.signals import POSITION, SPEED, Bools, Demand, Disturbed, Floats, Formed, Ints, Messages, Motion, Seen, Start
-from trainctl.stages import control, driver, orders, plant, protect, record, rerouters, topology, traffic
+from trainctl.stages import control, driver, orders, plant, protect, record, rerouters, signals, topology, traffic
 from trainctl.steps import Steps
 from trainctl.topology import exchange
 from trainctl.world import World
@@ -36,6 +36,7 @@ class State(NamedTuple):
     own: Floats  # (U, 2 or 3) position [m], speed [m/s], force [N] of every unit
     orders: orders.State
     rerouters: Ints  # (n,) edge on which a train found no way round what is closed, -1: none
+    signals: signals.State
     traffic: traffic.State
     rule: Any  # of the formation rule: ``slots.State`` or ``convoys.State``
     formed: Formed
@@ -66,16 +67,18 @@ class Loop(Steps):
         super().__init__(model, journal)
         self.world, self.built = world, model
         p, run = model, model.scenario.run
+        self.ours = ~p.roster.driven
         self.disturbances = disturbance.signals(p.scenario.disturbance, p.scenario.ids, run.step_s, run.seed, p.worst)
         self.rerouters = rerouters.Rerouters(p, journal)
         self.orders, self.traffic = orders.Orders(p, journal), traffic.Traffic(p, journal)
+        self.signals = signals.Signals(p, journal)
         self.topology = topology.Topology(p, journal)
         self.control, self.driver, self.plant = control.Control(p, p.radio), driver.of(p), plant.of(p, p.radio)
         self.protect = protect.Protect(p, journal, bool(len(self.disturbances.whole)) or self.plant.noisy)
         rule, formed = self.topology.rule.initial()
         self.state = State(
             k=0, own=p.own.copy(), orders=self.orders.initial(), rerouters=self.rerouters.initial(),
-            traffic=self.traffic.initial(), rule=rule, formed=formed,
+            signals=self.signals.initial(), traffic=self.traffic.initial(), rule=rule, formed=formed,
             messages=exchange.silent(), demand=self.control.initial(), memory=(),
             commanded=np.full(len(p.scenario.ids), np.nan), plant=self.plant.initial(), watch=self.record.initial(),
         )  # fmt: skip
@@ -97,14 +100,19 @@ class Loop(Steps):
             world.route(i, edges)
         here, ways, speed = world.measure(), world.ways, own[leading, SPEED]
 
+        # signals: what they show -> how far every train may go before one, where they are obeyed
+        shown, red = self.signals.step(t, ways, here, speed, s.traffic, world.box, s.signals)
+
         # traffic: departures, stops -> entries; whose turn it is; what is ahead of every train, where anybody asks
         late = self.plant.overrun(own, p.driver_rules.service_mps2)
-        going, around = self.traffic.step(t, ways, here, speed, late, s.traffic)
+        going, around = self.traffic.step(t, ways, here, speed, late, s.traffic, red=red)
         for i, v in around.entries:
             own[p.consists.first[i] : p.consists.first[i + 1], SPEED] = v
             world.insert(i, v)
-        for i in np.flatnonzero(going.parked != s.traffic.parked).tolist():
+        for i in np.flatnonzero((going.parked != s.traffic.parked) & self.ours).tolist():
             world.park(i, bool(going.parked[i]))
+        for i in np.flatnonzero((going.standing != s.traffic.standing) & ~(going.parked | s.traffic.parked) & self.ours).tolist():
+            world.halt(i, bool(going.standing[i]))
 
         # topology: -> who hears whom, desired spacing and bounds of each link, the law's constants
         seen = here._replace(position=here.position + s.formed.offset)
@@ -127,7 +135,7 @@ class Loop(Steps):
 
         # protect, plant: the supervisor tries the step without what disturbs it; the plant then takes it with
         past, units = self.plant.taken(units) if self.record.due(s.k) else (None, units)
-        stands = ~here.present | driven.stands
+        stands = ~(here.present & self.ours) | driven.stands
         stands[[turn.train for turn in around.turns]] = True
 
         def over_the_step(ordered: Floats, disturbed: Disturbed, state: plant.State, calm: bool) -> plant.Moved:
@@ -145,7 +153,8 @@ class Loop(Steps):
         # record, command and step
         watch = s.watch._replace(acting=acts)
         together = going.on_track(here)
-        self.record.step(s.k, t, ways, together, seen, own, formed, demand, moved.motion, past, acting, watch)
+        told = moved.motion._replace(input=np.where(self.ours, moved.motion.input, np.nan))
+        self.record.step(s.k, t, ways, together, seen, own, formed, demand, told, past, acting, watch)
         self.record.waits(t, together, speed, going, around, self.traffic.due(t, going), watch)
         for turn in around.turns:
             world.turn(*turn)
@@ -154,7 +163,8 @@ class Loop(Steps):
         if around.turns:
             moved, formed = self._turned(t, [turn.train for turn in around.turns], moved, formed, going, watch)
         return State(
-            s.k + 1, moved.own, ordered, stuck, going, rule, formed, moved.messages, demand, memory, s.commanded, moved.state, watch
+            s.k + 1, moved.own, ordered, stuck, shown, going, rule, formed, moved.messages, demand, memory, s.commanded,
+            moved.state, watch,
         )  # fmt: skip
 
     def end(self) -> None:
@@ -162,7 +172,9 @@ class Loop(Steps):
         s, world, t = self.state, self.world, self.time
         own, here, ways = self._measured(s), world.measure(), world.ways
         late = self.plant.overrun(own, self.p.driver_rules.service_mps2)
-        going, around = self.traffic.step(t, ways, here, own[self.p.leading, SPEED].copy(), late, s.traffic, last=True)
+        speed = own[self.p.leading, SPEED].copy()
+        _, red = self.signals.step(t, ways, here, speed, s.traffic, world.box, s.signals)
+        going, around = self.traffic.step(t, ways, here, speed, late, s.traffic, last=True, red=red)
         seen = here._replace(position=here.position + s.formed.offset)
         rule, formed, messages, own, seen, scene = self.topology.step(
             t, seen, own, around, going, s.rule, s.formed, s.messages
@@ -190,7 +202,9 @@ class Loop(Steps):
 
     def outcome(self) -> dict[str, Any]:
         """What run.json says of the finished run."""
-        return self.record.alarms.outcome(self.not_entered, self.state.watch.alarms)
+        sent, received = self.state.messages.counted.tolist()
+        told = self.record.alarms.outcome(self.not_entered, self.state.watch.alarms)
+        return told | ({"messages_sent": sent, "messages_received": received} if sent else {})
 
     def _start(self) -> None:
         """Put the trains on the railway: those that are placed, and those due at time 0."""
@@ -206,7 +220,8 @@ class Loop(Steps):
             ways = lay_out(p.line, start)
             row = ways.first[:-1]
             nobody = Seen(ways.begin[row] + start.lane_position, ways.edge[row], row, start.present)
-            going, _, entries, _ = self.traffic.entering(0.0, ways, nobody, speed.copy(), s.traffic, due)
+            red = self.signals.before(ways, nobody) if p.obeys else None
+            going, _, entries, _ = self.traffic.entering(0.0, ways, nobody, speed.copy(), s.traffic, due, red=red)
             for i, v in entries:
                 start.present[i], start.speed[i] = True, v
                 s.own[first[i] : first[i + 1], SPEED] = v
@@ -217,7 +232,11 @@ class Loop(Steps):
         """SUMO owns where a train is: shift every train, as a whole, onto its measured front."""
         own = s.own.copy()
         shift = self.world.measure().position + s.formed.offset - own[self.p.leading, POSITION]
-        own[:, POSITION] += np.repeat(shift, np.diff(self.p.consists.first))
+        units = np.diff(self.p.consists.first)
+        own[:, POSITION] += np.repeat(shift, units)
+        if (box := self.world.box) is not None:  # trains that SUMO drives run as a whole
+            speeds = np.repeat(box.speeds(), units)
+            own[:, SPEED] = np.where(np.isnan(speeds), own[:, SPEED], speeds)
         return own
 
     def _relinked(self, t: float, scene: Any, formed: Formed, units: plant.State, watch: record.State) -> plant.State:

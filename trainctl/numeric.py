@@ -42,6 +42,8 @@ def go_on(ways: Ways, length_m: Floats, displacement: Floats, row: Ints, lane_po
 class Numeric:
     """The line without a simulator: trains follow their ways by addition, and leave at the end."""
 
+    box = None  # no signals
+
     def __init__(self, line: Line) -> None:
         self.line = line
 
@@ -78,6 +80,9 @@ class Numeric:
     def turn(self, train: int, edges: tuple[str, ...], arrival: float) -> None:
         """Let a train turn back with the next move."""
         self.turning.append((train, edges, arrival))
+
+    def halt(self, train: int, stands: bool) -> None:
+        """Nobody sets signals here."""
 
     def linked(self, links: Links, formation: Ints) -> None:
         """Nobody looks."""

@@ -11,6 +11,7 @@ import time
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,7 +20,7 @@ import tomli_w
 import sumo_net
 from sumo_net import LineError
 from sumo_net.netfile import unpack
-from trainctl.errors import InputError, SimulatorError
+from trainctl.errors import InputError, SimulatorError, left_out
 from trainctl.loop import Loop
 from trainctl.metrics.run import metrics
 from trainctl.numeric import Numeric
@@ -132,12 +133,17 @@ def _opened(
     """The same for every run, whoever drives its trains."""
     every = checkpoint_every_s
     step = p.scenario.run.step_s
+    if p.obeys and (backend != "sumo" or gui is not None):
+        key = 'others = "sumo"' if p.roster.driven.any() else 'signals = "obey"'
+        raise InputError(f"traffic.{key}: SUMO sets the signals: no --backend numeric, no --gui")
     if every is not None and not (every >= step and abs(every / step - round(every / step)) < 1e-6):
         raise InputError(f"--checkpoint-every {every:g}: must be a multiple of step_s = {step:g}")
     if every is not None and gui is not None:
         raise InputError("--checkpoint-every: a run that is watched cannot be resumed; leave out --gui")
     if backend == "sumo" and "," in (place := str(Path(out).absolute())):
         raise InputError(f"{place}: SUMO takes a comma for the end of a file's name: choose an --out without, or --backend numeric")
+    if backend == "sumo" and gui is None and find_spec("libsumo") is None:
+        raise InputError(f"{left_out('libsumo')}; without it: --backend numeric")
     partial = open_partial(out, force)
     with held(partial):
         text = p.scenario.toml()
@@ -420,13 +426,14 @@ def open_world(p: Model, folder: Path, backend: Backend, gui: str | None = None)
     if backend == "numeric":
         return Numeric(p.line)
     from trainctl.sumo.session import Sumo
+    from trainctl.sumo.signal_box import obeyed
 
     run, (net, place) = p.scenario.run, _net(p, folder)
     if gui is not None:
         from trainctl.sumo.gui import Gui, Map
 
         return (Gui if p.placed else Map)(p.line, net, place, run.step_s, run.steps, run.record_every_s, gui)
-    return Sumo(p.line, net, place, run.step_s, run.steps, run.record_every_s)
+    return Sumo(p.line, net, place, run.step_s, run.steps, run.record_every_s, obeyed(p))
 
 
 def open_self_driven(p: Model, folder: Path) -> SelfDriven:

@@ -381,6 +381,12 @@ class Messages(NamedTuple):
     sent: tuple[Floats, ...]  # (n, w) each, oldest first
     heard: Floats  # (L, w)
     ever: Bools  # (L,) it has brought something
+    newest: Ints  # (L,) number of the exchange in which that was sent, -1: none
+    bad: Ints  # (L,) whether the channel is in its bad state, -1: not known yet
+    spoke: tuple[Bools, ...]  # (n,) each, as ``sent``: who sent at all
+    said: Floats  # (n,) m, place relative to the reference when it last sent
+    quiet: Ints  # (n,) exchanges since
+    counted: Ints  # (2,) messages sent and received since the start
 
 
 class Formed(NamedTuple):

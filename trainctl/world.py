@@ -8,7 +8,20 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from trainctl.railway.ways import Ways
-from trainctl.signals import Floats, Ints, Links, Observed, Seen, Start
+from trainctl.signals import Bools, Floats, Ints, Links, Observed, Seen, Start
+
+
+class SignalBox(Protocol):
+    """Whoever sets the rail signals that trains obey, and drives trains of its own among them."""
+
+    def green(self, signals: Ints) -> Bools:
+        """Whether signals (Q,), by their numbers in the roster, show green, shape (Q,)."""
+
+    def blocker(self, signal: int) -> int:
+        """A train because of which a signal is red, -1 if none is known."""
+
+    def speeds(self) -> Floats:
+        """Speed of every train that it drives itself [m/s], shape (n,), NaN for the others."""
 
 
 class World(Protocol):
@@ -17,6 +30,10 @@ class World(Protocol):
     @property
     def ways(self) -> Ways:
         """The ways of all trains as they are now ordered."""
+
+    @property
+    def box(self) -> SignalBox | None:
+        """Who sets the signals; None: nobody obeys any."""
 
     def start(self, start: Start) -> None:
         """Put the trains on the line; afterwards ``measure`` gives their initial positions."""
@@ -28,10 +45,13 @@ class World(Protocol):
         """Give a train another route; ``edges`` begins with the edge it is on, internal ones included."""
 
     def insert(self, train: int, speed: float) -> None:
-        """Put a train on the net where it was to start; it is there after the next ``move``."""
+        """Put a train on the net where it was to start; it is there after the next ``move``, or signals keep it out."""
 
     def park(self, train: int, off: bool) -> None:
         """Take a train that stands off its track, or put it back: both come with the next ``move``, in which it stands."""
+
+    def halt(self, train: int, stands: bool) -> None:
+        """Say that a train stands at a stop of its own, or goes on: where signals are obeyed, it asks for none meanwhile."""
 
     def turn(self, train: int, edges: tuple[str, ...], arrival: float) -> None:
         """Let a train that stands turn back with the next ``move``, in which it stands: its rear becomes its front.

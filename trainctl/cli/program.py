@@ -28,7 +28,7 @@ from trainctl.cli.console import (
     show,
     show_json,
 )
-from trainctl.errors import InputError, TrainctlError
+from trainctl.errors import InputError, TrainctlError, left_out
 
 if TYPE_CHECKING:
     from trainctl.runs.run import Run
@@ -64,6 +64,7 @@ def run(
     """Run a scenario into a run folder: logs, metrics, SUMO's own logs.
 
     Exit 1 if trains collided or waited for each other in a circle; with the supervisor on also if one was too fast for its line.
+    A law that is a file is a program: it is executed.
     """
     from trainctl import runner
     from trainctl.record.folder import place_for, run_name
@@ -151,7 +152,10 @@ def list_(as_json: Json = False) -> None:
 
 @app.command()
 def check(name: ScenarioName = DEFAULT_SCENARIO, settings: Settings = None, as_json: Json = False) -> None:
-    """Check a scenario without running it: every mistake, every assumption of its law, and what follows from them."""
+    """Check a scenario without running it: every mistake, every assumption of its law, and what follows from them.
+
+    A law that is a file is a program: it is executed.
+    """
     model = named(name, settings)
     from trainctl.scenario.check import facts
 
@@ -255,7 +259,10 @@ def plot(
 def schema(
     law: Annotated[str | None, typer.Option(help="Also the keys of this law's [controller] table.")] = None,
 ) -> None:
-    """Print the JSON Schema of scenario files."""
+    """Print the JSON Schema of scenario files.
+
+    A law that is a file is a program: it is executed.
+    """
     from trainctl.laws import find_law, laws
     from trainctl.scenario.tables import Scenario
 
@@ -269,9 +276,9 @@ def schema(
 
 def _version(wanted: bool) -> None:
     if wanted:
-        from importlib.metadata import version
+        from trainctl.record.folder import installed
 
-        say(f"trainctl {version('trainctl')}, SUMO {version('libsumo')}")
+        say(f"trainctl {installed('trainctl')}, SUMO {installed('libsumo') or 'not installed'}")
         raise typer.Exit
 
 
@@ -316,6 +323,11 @@ def main() -> None:
     except TrainctlError as error:
         _tell([f"trainctl: {error}"])
         sys.exit(error.exit_code)
+    except ImportError as error:
+        if not (words := left_out(error.name or "")):
+            raise
+        _tell([f"trainctl: {words}"])
+        sys.exit(2)
     except (KeyboardInterrupt, typer.Abort):
         _tell(["trainctl: interrupted"])
         sys.exit(130)

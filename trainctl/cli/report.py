@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from trainctl.runs.run import Run
 
 
-CAPACITY = "compare capacity"
+CAPACITY, SPACING = "compare capacity", "compare spacing"
 
 
 def register(app: typer.Typer) -> None:
@@ -42,14 +42,17 @@ def compare(
         list[str],
         typer.Argument(
             metavar="RUN...",
-            help="Run folders; with --controllers all one scenario; or the word capacity (./capacity is a folder).",
+            help="Run folders; with --controllers all one scenario; or the word capacity or spacing (./capacity is a folder).",
         ),
     ],
     controllers: Annotated[
         Literal["all"] | None, typer.Option(help="all: run the scenario under every law that can drive its traffic, and compare.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Where figures and runs go; default runs/compare, with capacity runs/capacity.")
+        Path | None, typer.Option(help="Where figures and runs go; default runs/compare, runs/capacity, runs/spacing.")
+    ] = None,
+    further: Annotated[
+        list[str] | None, typer.Option("--law", metavar="FILE", help="With --controllers: a law in a file, too; repeatable.")
     ] = None,
     backend: Annotated[Literal["sumo", "numeric"], typer.Option(help="With --controllers: SUMO, or the loop without it.")] = "sumo",
     formats: Annotated[list[str] | None, typer.Option("--format", help="png, svg, pdf; repeatable; default png.")] = None,
@@ -57,7 +60,7 @@ def compare(
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="With --controllers: override a key of the scenario.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")] = False,
-    trains: Annotated[int | None, typer.Option(help="Trains; default 40.", rich_help_panel=CAPACITY)] = None,
+    trains: Annotated[int | None, typer.Option(help="Trains; default 40, with spacing 6.", rich_help_panel=CAPACITY)] = None,
     length_km: Annotated[float | None, typer.Option(help="Measured stretch in km; default 100.", rich_help_panel=CAPACITY)] = None,
     speed_mps: Annotated[float | None, typer.Option(help="Line speed in m/s; default 83.333.", rich_help_panel=CAPACITY)] = None,
     signals_m: Annotated[float | None, typer.Option(help="Blocks in m; default 2000.", rich_help_panel=CAPACITY)] = None,
@@ -65,13 +68,35 @@ def compare(
         float | None, typer.Option(help="Desired spacing of the formations in m; default 3000.", rich_help_panel=CAPACITY)
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Runs at a time; default one per core.", rich_help_panel=CAPACITY)
+        int | None, typer.Option(min=1, help="Rows at a time; default one per core.", rich_help_panel=CAPACITY)
     ] = None,
+    rows_: Annotated[
+        str | None, typer.Option("--rows", metavar="ROW,...", help="Only these rows.", rich_help_panel=SPACING)
+    ] = None,
+    stops: Annotated[int | None, typer.Option(help="Emergency stops; default 200.", rich_help_panel=SPACING)] = None,
+    searched: Annotated[
+        int | None, typer.Option(help="The first so many of them are searched with; default 20.", rich_help_panel=SPACING)
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of what is random in them; default 1.", rich_help_panel=SPACING)] = None,
+    loss: Annotated[float | None, typer.Option(help="Messages lost in good times; default 0.02.", rich_help_panel=SPACING)] = None,
+    delay_s: Annotated[float | None, typer.Option(help="Age of messages in s; default 1.", rich_help_panel=SPACING)] = None,
+    bad_s: Annotated[
+        float | None, typer.Option(help="Mean length of times when none arrives in s; default 3, 0: none.", rich_help_panel=SPACING)
+    ] = None,
+    brake_scatter: Annotated[
+        float | None, typer.Option(help="Share by which brakes scatter, either way; default 0.05.", rich_help_panel=SPACING)
+    ] = None,
+    in_sumo: Annotated[
+        bool, typer.Option("--in-sumo", help="Check the spacings that were found in SUMO as well.", rich_help_panel=SPACING)
+    ] = False,
 ) -> None:
     """Compare runs: one table, also in LaTeX, and figures with all of them in one axis.
 
     `trainctl compare capacity` runs the same trains on the same line under SUMO's fixed block and moving block and under every law:
     headway, trains per hour, journey time, energy, collisions.
+
+    `trainctl compare spacing` finds for every law the smallest spacing at which nobody touches when the first train makes an
+    emergency stop, in all of many stops with late and lost messages and brakes that scatter.
     """
     from trainctl.cli.console import listing, show, show_json
     from trainctl.runs.run import Run
@@ -85,6 +110,25 @@ def compare(
         "trains": trains, "length_m": None if length_km is None else 1000.0 * length_km, "speed_mps": speed_mps,
         "signals_m": signals_m, "spacing_m": spacing_m,
     }  # fmt: skip
+    of_spacing = {
+        "stops": stops, "searched": searched, "seed": seed, "loss": loss, "delay_s": delay_s, "bad_s": bad_s,
+        "brake_scatter": brake_scatter,
+    }  # fmt: skip
+    if names == ["spacing"] and controllers is None:
+        from trainctl.cli.spacing import spacing
+
+        others = {"length-km": length_km, "signals-m": signals_m, "spacing-m": spacing_m, "set": settings}
+        idle = [f"--{key}" for key, value in others.items() if value] + ["--backend"] * (backend != "sumo")
+        if idle:
+            raise InputError([f"{option}: not with `trainctl compare spacing`" for option in idle])
+        asked = {**of_spacing, "trains": trains, "speed_mps": speed_mps}
+        asked = {key: value for key, value in asked.items() if value is not None}
+        spacing(asked, rows_, out or Path("runs/spacing"), wanted, workers, as_json, in_sumo)
+        return
+    given: dict[str, Any] = {key.replace("_", "-"): value for key, value in of_spacing.items()}
+    given |= {"rows": rows_, "in-sumo": in_sumo or None}
+    if idle := [f"--{key}: only with `trainctl compare spacing`" for key, value in given.items() if value is not None]:
+        raise InputError(idle)
     if names == ["capacity"] and controllers is None:
         if settings or backend != "sumo":
             raise InputError("capacity: takes no --set and no --backend; its scenarios lie in --out afterwards")
@@ -98,30 +142,44 @@ def compare(
     out = out or Path("runs/compare")
     left_out: dict[str, list[str]] = {}
     if controllers is None:
-        if settings:
-            raise InputError("--set: only with --controllers all, which runs something")
+        if settings or further:
+            option = "--set" if settings else "--law"
+            raise InputError(f"{option}: only with --controllers all, which runs something")
         runs = [Run(Path(name)) for name in names]
         labels = comparing.names(runs)
     else:
         if len(names) != 1:
             raise InputError("--controllers all: give exactly one scenario")
-        runs, labels, left_out = _under_all(names[0], out, backend, settings)
+        runs, labels, left_out = _under_all(names[0], out, backend, settings, further or [])
     rows = comparing.table(runs)
     figures = comparing.figures(runs, labels, out, wanted)
     tex = out / "compare.tex"
     tex.write_text(comparing.latex(rows, labels), encoding="utf-8")
     if as_json:
-        show_json({"runs": labels, "rows": rows, "left_out": left_out, "figures": figures, "latex": tex})
+        controllers_ = {label: run.scenario["controller"] for label, run in zip(labels, runs, strict=True)}
+        told = {"runs": labels, "controllers": controllers_, "rows": rows, "left_out": left_out}
+        show_json({**told, "figures": figures, "latex": tex})
         return
     table = listing(None, "metric", *(label.replace("_", " ") for label in labels), "unit")
     for row in rows:
         fill(table, row["metric"], *(number(value) for value in row["values"]), row["unit"])
     show(table)
+    for label, run in zip(labels, runs, strict=True) if controllers is not None else ():
+        say(f"{label}: {_gains(run)}")
     for name, reasons in left_out.items():
         for reason in reasons:
             say(f"{name} is left out: {reason}")
     for path in [*figures, tex]:
         say(path)
+
+
+def _gains(run: Run) -> str:
+    """The keys of a run's law, its plant and periods, in words."""
+    tables = run.scenario
+    keys = {key: value for key, value in tables["controller"].items() if key != "law"}
+    keys |= {key: tables["run"][key] for key in ("control_period_s", "sub_step_s") if key in tables["run"]}
+    words = ", ".join(f"{key} = {number(value)}" for key, value in keys.items())
+    return f"{tables['controller']['law']} on {tables.get('plant', {}).get('kind', 'point')}: {words}"
 
 
 def _capacity(given: dict[str, Any], out: Path, formats: tuple[str, ...], workers: int | None, as_json: bool) -> None:
@@ -153,9 +211,9 @@ def _capacity(given: dict[str, Any], out: Path, formats: tuple[str, ...], worker
 
 
 def _under_all(
-    name: str, out: Path, backend: Literal["sumo", "numeric"], settings: list[str] | None
+    name: str, out: Path, backend: Literal["sumo", "numeric"], settings: list[str] | None, files: list[str]
 ) -> tuple[list[Run], list[str], dict[str, list[str]]]:
-    """Run one scenario under every law; the runs, their names, and who could not and why."""
+    """Run one scenario under every law, its own and those in files too; the runs, their names, and who could not and why."""
     import sys
 
     from trainctl import runner
@@ -167,8 +225,12 @@ def _under_all(
     from trainctl.studies import compare as comparing
 
     data, path = read(name, dict(map(setting, settings or [])))
-    runs, labels, left_out = [], [], {}
-    for law, changed in comparing.alternatives(data, laws()).items():
+    more, left_out = comparing.others(data, laws(), path.parent, files)
+    tables = {**comparing.alternatives(data, laws()), **more}
+    if strange := comparing.strange(data, list(tables)):
+        raise InputError([f"{path.name}: {line}" for line in strange])
+    runs, labels = [], []
+    for law, changed in tables.items():
         try:
             scenario, found = examine(changed)
             if scenario is None:

@@ -25,6 +25,7 @@ def resume(
     """Go on with a run that was killed, from its last checkpoint (`trainctl run --checkpoint-every S`).
 
     It ends with the same files, and the same exit code, as a run that was not killed. Without checkpoints it begins again.
+    A law that is a file is a program: it is executed.
     """
     from trainctl import runner
     from trainctl.cli.console import Progress, show_json

@@ -51,6 +51,7 @@ def register(app: typer.Typer) -> None:
 
         OUT gets results.parquet (one row per run: parameters, status, violations, metrics), summary.png and sweep.json. Exit 3
         if runs failed or were refused; the others are there all the same. A collision is a result of its run, not a failed run.
+        A law that is a file is a program: it is executed.
         """
         from trainctl.cli.console import show_json
         from trainctl.studies import sweep as sweeping

@@ -59,6 +59,12 @@ WATCHED = ("interval_m",)
 FIGURES = {"unit_speeds": "fig3", "speed_over_position": "fig4", "couplers": "fig5", "gaps": "fig6"}
 COMPARED: dict[str, dict[str, Any]] = {"emu_finite_time": {"alpha_1": 0.9}, "ordinary_consensus": {"alpha_1": 1.0}}
 
+#: What a train is told in `trainctl compare spacing`, and why its spacing is what it is there.
+IN_STOPS = (
+    "heads and tails of neighbours. The reference pulls on at its speed; the barrier acts in the emergency zone "
+    "alone, a part of the spacing"
+)
+
 #: Columns of a message: head and tail relative to the leader (the tail moved forward by the units ahead of it), train length.
 HEAD, HEAD_SPEED, TAIL, TAIL_SPEED, LENGTH_OF_TRAIN = range(5)
 MESSAGE = 5

@@ -76,6 +76,11 @@ FIGURES = {
 #: Rows of a comparison -> the keys of [controller] that make them.
 COMPARED: dict[str, dict[str, Any]] = {"fault_tolerant": {}}
 
+#: What a train is told in `trainctl compare spacing`, and why its spacing is what it is there.
+IN_STOPS = (
+    "neighbours' estimated places and speeds. Barriers on distances and speed differences grow without bound before trains touch"
+)
+
 #: Columns of ``estimate`` and ``correction``.
 X, V, W = 0, 1, 2
 X_RATE, V_RATE, W_DRIFT, UNCOMPENSATED, STATIC = 0, 1, 2, 3, 4

@@ -69,6 +69,12 @@ FIGURES = {"positions": "fig3", "spacing": "fig4", "speeds": "fig5", "inputs": "
 #: Rows of a comparison -> the keys of [controller] that make them.
 COMPARED: dict[str, dict[str, Any]] = {"fully_distributed": {}}
 
+#: What a train is told in `trainctl compare spacing`, and why its spacing is what it is there.
+IN_STOPS = (
+    "neighbours say where they will be a period ahead. Its speeds must be reached within one period, so it cannot "
+    "stop: another law must"
+)
+
 #: A start on a bound is inside; sums of positions are good to about 1e-9.
 ROUNDING = 1e-6
 

@@ -73,6 +73,9 @@ FOLLOWS = True
 #: Rows of a comparison -> the keys of [controller] that make them.
 COMPARED: dict[str, dict[str, Any]] = {"model_predictive": {}}
 
+#: What a train is told in `trainctl compare spacing`, and why its spacing is what it is there.
+IN_STOPS = "place, speed and plan of the train ahead. It starts only where the best brake ahead leaves the worst one room"
+
 #: Flags of DAQP: a constraint that is active, at its upper or at its lower bound.
 ACTIVE_UPPER, ACTIVE_LOWER = 1, 3
 
@@ -96,6 +99,12 @@ class Params(Table):
         None,
         gt=0.0,
         description="Full braking every train is sure of, b [m/s2]; default from braking_n and the input's bound.",
+    )
+    ahead_braking_mps2: float | None = Field(
+        None, gt=0.0, description="Full braking of the train ahead that is reckoned with, b_l [m/s2]; default what it sends."
+    )
+    deceleration_mps2: float = Field(
+        1.0, gt=0.0, description="Deceleration asked for where no plan is feasible [m/s2]; full braking, if that is more."
     )
     jerk_mps3: float = Field(0.5, gt=0.0, description="Maximum jerk [m/s3].")
     margin_m: float = Field(10.0, ge=0.0, description="Gap that is always kept [m].")
@@ -202,7 +211,7 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
         solved = _solved(c, i, own, other, spacing, a_l, float(before[i]), state.active[i])
         if solved is None:
             infeasible[i] = True
-            plan[i] = -min(c.b[i], own.speed[i] / c.T)
+            plan[i] = -min(max(c.b[i], c.params.deceleration_mps2), own.speed[i] / c.T)
             plan[i, 1:] = np.where(own.speed[i] + c.T * np.cumsum(plan[i])[:-1] > 0.0, plan[i, 1:], 0.0)
         else:
             plan[i], active[i] = solved
@@ -253,7 +262,8 @@ def _solved(
 def _safe(c: Constants, i: int, v: float, spacing: float, other: ahead.Seen) -> float:
     """Maximum speed a period from now [m/s] from which train ``i`` stops behind one that brakes from now on; -1: none."""
     p, b = c.params, float(c.b[i])
-    stands = spacing + 0.5 * float(other.speed[i]) ** 2 / float(other.braking[i])  # where that one stops, from here
+    b_l = p.ahead_braking_mps2 or float(other.braking[i])
+    stands = spacing + 0.5 * float(other.speed[i]) ** 2 / b_l  # where that one stops, from here
     left = stands - c.who.length[i] - p.margin_m - (1.0 - c.theta) * v * c.T
     late = b * (c.theta * c.T + p.reaction_s)
     return float(np.sqrt(late**2 + 2.0 * b * left)) - late if left > 0.0 else -1.0
@@ -276,7 +286,7 @@ def violations(params: Params, scene: Scene) -> list[str]:
     if found:
         return found
     for i in np.flatnonzero(who.follows).tolist():
-        b_l = b[scene.links.sender[who.row[i]]]
+        b_l = params.ahead_braking_mps2 or b[scene.links.sender[who.row[i]]]
         needed = float(who.length[i]) + params.margin_m + top * (scene.control_period + params.reaction_s)
         needed += max(0.5 * top**2 / float(b[i]) - 0.5 * top**2 / float(b_l), 0.0)
         if who.desired[i] < needed:
@@ -299,3 +309,9 @@ def alternative(tables: stated.Tables) -> dict[str, Any]:
 def on_a_line(tables: stated.Tables, band: dict[str, float]) -> dict[str, Any]:
     """Tables of its row in `trainctl compare capacity`."""
     return {**alternative(tables), "bounds": {"speed_upper_mps": band["speed_upper_mps"]}}
+
+
+def in_stops(tables: stated.Tables, band: dict[str, float], braking: tuple[float, float]) -> dict[str, Any]:
+    """Tables of its row in `trainctl compare spacing`: its own brakes are the worst, those ahead the best."""
+    sure, best = braking
+    return {**on_a_line(tables, band), "controller": {**tables["controller"], "braking_mps2": sure, "ahead_braking_mps2": best}}

@@ -60,6 +60,11 @@ FOLLOWS = True
 #: Rows of a comparison -> the keys of [controller] that make them.
 COMPARED: dict[str, dict[str, Any]] = {"relative_braking": {}}
 
+#: What a train is told in `trainctl compare spacing`, and why its spacing is what it is there.
+IN_STOPS = (
+    "place and speed of the train ahead. Brakes plan with what every train is sure of; a better brake ahead takes from the margin"
+)
+
 
 class Params(Table):
     """Keys of ``[controller]`` with ``law = "relative_braking"``."""
@@ -75,6 +80,9 @@ class Params(Table):
     )
     margin_m: float = Field(10.0, ge=0.0, description="Gap that must be left at standstill [m].")
     acceleration_mps2: float = Field(0.5, gt=0.0, description="Maximum acceleration asked for [m/s2].")
+    deceleration_mps2: float = Field(
+        1.0, gt=0.0, description="Maximum deceleration asked for [m/s2]; full braking, if that is more."
+    )
     faster_mps: float = Field(3.0, gt=0.0, description="At most so much faster than the reference, to close up [m/s].")
 
 
@@ -87,6 +95,7 @@ class Constants(NamedTuple):
     t_f: float  # s
     M: Floats  # m
     pulls: float  # m/s2
+    brakes: Floats  # m/s2
     faster: float  # m/s
     bounds: Bounds
 
@@ -95,7 +104,8 @@ def constants(params: Params, scene: Scene) -> Constants:
     """Constants of the law; see ``SampledLaw``."""
     who, b = ahead.followed(scene), ahead.full_braking(scene, params.braking_mps2)
     return Constants(
-        who, b, params.reaction_s, _follow_s(params), _margins(params, scene, who, b), params.acceleration_mps2, params.faster_mps,
+        who, b, params.reaction_s, _follow_s(params), _margins(params, scene, who, b), params.acceleration_mps2,
+        np.maximum(b, params.deceleration_mps2), params.faster_mps,
         scene.bounds,
     )  # fmt: skip
 
@@ -151,7 +161,7 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
     w = np.sqrt(np.maximum(np.square(c.b * c.t_r) + 2.0 * c.b * room, 0.0)) - c.b * c.t_r
     asked = (np.maximum(w, 0.0) - own.speed) / c.t_f
     cruise = ahead.cruising(own, leader, c.who.follows, c.faster, c.bounds.speed_upper)
-    return Demand(*ahead.within(ahead.combined(asked, cruise, c.who.follows, other.known), c.b, c.pulls, c.bounds, own))
+    return Demand(*ahead.within(ahead.combined(asked, cruise, c.who.follows, other.known), c.brakes, c.pulls, c.bounds, own))
 
 
 # What must hold before the law may be used
@@ -201,3 +211,9 @@ def alternative(tables: stated.Tables) -> dict[str, Any]:
 def on_a_line(tables: stated.Tables, band: dict[str, float]) -> dict[str, Any]:
     """Tables of its row in `trainctl compare capacity`."""
     return {**alternative(tables), "bounds": {"speed_upper_mps": band["speed_upper_mps"]}}
+
+
+def in_stops(tables: stated.Tables, band: dict[str, float], braking: tuple[float, float]) -> dict[str, Any]:
+    """Tables of its row in `trainctl compare spacing`: it plans with the braking every train is sure of."""
+    sure, _ = braking
+    return {**on_a_line(tables, band), "controller": {**tables["controller"], "braking_mps2": sure}}

@@ -60,6 +60,12 @@ FIGURES = {"positions": "fig2", "speeds_and_inputs": "fig3", "spacing": "fig4", 
 #: Rows of a comparison -> the keys of [controller] that make them.
 COMPARED: dict[str, dict[str, Any]] = {"robust_constrained": {"h_per_s": 0.3}}
 
+#: What a train is told in `trainctl compare spacing`, and why its spacing is what it is there.
+IN_STOPS = (
+    "neighbours say where they are. The reference pulls on at its speed; all trains behind push, and only metres "
+    "times weight hold them"
+)
+
 #: Assumption 1: the input must exceed this many times the running resistance.
 KAPPA = 10.0
 

@@ -63,6 +63,12 @@ FOLLOWS = True
 #: Rows of a comparison -> the keys of [controller] that make them.
 COMPARED: dict[str, dict[str, Any]] = {"sliding_mode": {}}
 
+#: What a train is told in `trainctl compare spacing`, and why its spacing is what it is there.
+IN_STOPS = (
+    "place, speed and acceleration of the train ahead. It brakes as that one does at once, and keeps the whole "
+    "spacing for what scatters"
+)
+
 
 class Params(Table):
     """Keys of ``[controller]`` with ``law = "sliding_mode"``."""

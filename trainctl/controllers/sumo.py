@@ -96,8 +96,9 @@ def violations(params: Params, scene: Scene) -> list[str]:
 def unfit(scenario: Any) -> list[str]:
     """Parts of a ``scenario`` (``trainctl.scenario.tables.Scenario``) that SUMO's own trains would not feel."""
     found = [f"{key}: SUMO's own trains take none" for key in ("disturbance", "fault") if getattr(scenario, key)]
-    brakes = [k for k, event in enumerate(scenario.event, 1) if event.kind == "brake"]
-    found += [f"event[{k}].kind = brake: SUMO's own trains brake by SUMO's rules alone" for k in brakes]
+    rules = {"brake": "brake by SUMO's rules alone", "outage": "have no radio"}
+    events = [(k, event.kind) for k, event in enumerate(scenario.event, 1) if event.kind in rules]
+    found += [f"event[{k}].kind = {kind}: SUMO's own trains {rules[kind]}" for k, kind in events]
     given, network = scenario.controller.keys(), scenario.network
     if network.line is None and given.get("signals_m") is not None:
         found.append("controller.signals_m: a net has the signals it has; name a line, or build the net with signals_m")

@@ -1,4 +1,4 @@
-"""Metrics of stacked runs of point trains: what ``metrics`` computes from the tables of one run, from ``count.Counts`` of many.
+"""Metrics of stacked runs: what ``metrics`` computes from the tables of one run, from ``count.Counts`` of many.
 
 Every function gives one array per metric, a number per run; NaN where a run does not have it. Names and rules are those of
 ``metrics.run.DEFINITIONS``. Extremes, times and counts are the same to the last bit, sums to rounding.
@@ -6,12 +6,13 @@ Every function gives one array per metric, a number per run; NaN where a run doe
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from trainctl.ensemble import count
+from trainctl.ensemble import count, units
 from trainctl.ensemble.count import Counts, Fixed, Pairs
 from trainctl.ensemble.stack import Stack
 from trainctl.metrics.driving import JOULES_PER_KWH
@@ -112,8 +113,11 @@ def _listed(ids: tuple[str, ...], table: Floats) -> tuple[Floats, list[tuple[int
     return np.column_stack([ends, *(listed.column(name) for name in ("desired_m", "lower_m", "upper_m"))]), chain
 
 
-def metrics(stack: Stack, fixed: Fixed, chained: Chained, counts: Counts, recorded: Recorded) -> Columns:
-    """All metrics of all runs, those of single trains aside; see ``metrics.run.metrics``."""
+def metrics(
+    stack: Stack, fixed: Fixed, chained: Chained, counts: Counts, recorded: Recorded,
+    tallied: tuple[units.Watched, units.Tally] | None,
+) -> Columns:  # fmt: skip
+    """All metrics of all runs, those of single trains aside; see ``metrics.run.metrics``. ``tallied`` is of trains with units."""
     times, runs, n = recorded.times, len(stack.runs), stack.trains
     c = counts.train.reshape(runs, n, -1)
     kilometres = _sum(c[:, :, count.POSITION] - c[:, :, count.START]) / 1000
@@ -121,12 +125,12 @@ def metrics(stack: Stack, fixed: Fixed, chained: Chained, counts: Counts, record
         "run.duration_s": np.full(runs, float(np.ptp(times))),
         "run.trains": np.full(runs, float(n)),
         "run.train_km": kilometres,
-        **of_bounds(fixed, counts, runs),
+        **of_bounds(fixed, counts, runs, {} if tallied is None else units.margins(*tallied)),
         **of_formation(fixed, chained, counts, times, runs),
         "formation.final_speed_error_mps": c[:, :, count.SPEED_ERROR].max(axis=1),
         "formation.speed_overshoot_mps": c[:, :, count.OVERSHOOT].max(axis=1),
         "units.saturated_share": _sum(c[:, :, count.SATURATED]) / (n * len(times)),
-        **of_energy(stack, c, kilometres),
+        **(of_energy(stack, c, kilometres) if tallied is None else units.metrics(*tallied, kilometres, runs)),
         **of_comfort(c, times),
         **of_trains(stack, fixed, c, recorded),
     }
@@ -146,8 +150,8 @@ def _worst(number: Floats, of: Ints, runs: int, worse: np.ufunc) -> Floats:
     return np.where(np.isfinite(found), found, np.nan)
 
 
-def of_bounds(fixed: Fixed, counts: Counts, runs: int) -> Columns:
-    """As ``metrics.run.of_bounds``: a margin is smallest where the number itself is smallest or largest."""
+def of_bounds(fixed: Fixed, counts: Counts, runs: int, more: Mapping[str, tuple[Floats, Ints]]) -> Columns:
+    """As ``metrics.run.of_bounds``: a margin is smallest where the number itself is smallest or largest; ``more`` are couplers'."""
     c, q, known, pairs = counts.train, counts.pair, fixed.known, fixed.pairs
     with np.errstate(invalid="ignore"):
         margins = {
@@ -157,6 +161,7 @@ def of_bounds(fixed: Fixed, counts: Counts, runs: int) -> Columns:
             "speed_upper_margin_mps": (known.speed_upper - c[:, count.SPEED_MAX], fixed.run),
             "input_lower_margin_mps2": (c[:, count.INPUT_MIN] - known.input_lower, fixed.run),
             "input_upper_margin_mps2": (known.input_upper - c[:, count.INPUT_MAX], fixed.run),
+            **more,
         }
     found = {f"bounds.{name}": _worst(margin, of, runs, np.minimum) for name, (margin, of) in margins.items()}
     broken = np.sum([margin < -SLACK for margin in found.values()], axis=0)

@@ -61,8 +61,6 @@ def alone(p: Model) -> str | None:
         return "supervisor.mode is not off"
     if any(not _at_once(event) and event.time_s < run.duration_s for event in p.scenario.event):
         return "it has events on the way"
-    if p.has_units:
-        return "its trains are of units"
     if p.plant.noise_hold(p.plant_params) is not None:
         return "its plant has noise of its own"
     return None
@@ -80,8 +78,9 @@ def kind(p: Model) -> tuple[Any, ...]:
     top = s.topology
     return (
         p.law, p.params, p.plant, p.plant_params, p.observer, p.observer_params, id(p.line),
-        s.run.model_copy(update={"seed": None}), top.loss, top.delay_s, top.range_m, top.communication_period_s, s.fault,
+        s.run.model_copy(update={"seed": None}), top.loss, top.delay_s, top.range_m, top.communication_period_s, s.channel, s.fault,
         p.consists.first.tobytes(), s.ids, reference.breaks.tobytes(), reference.position[:, 1:].tobytes(),
+        s.bounds.coupler_lower_m, s.bounds.coupler_upper_m,
     )  # fmt: skip
 
 

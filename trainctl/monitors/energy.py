@@ -23,7 +23,9 @@ ROUNDING = 1e-9
 class State(NamedTuple):
     """What is remembered, shape (n,) each; its arrays are overwritten in place."""
 
-    stored: Floats  # J, kinetic and coupler energy at the last row; NaN before the first, and of trains that are not there
+    stored: (
+        Floats  # J, kinetic and coupler energy at the last row; NaN before the first, and of trains that are not there or not ours
+    )
     drift: Floats  # J, energy that came from nowhere since the start
     turnover: Floats  # J, sum of all integrated powers' sizes
     kicked: Floats  # J, energy that speed disturbances have given since the last row
@@ -40,6 +42,7 @@ class Balance:
         self.leading, self.units = c.first[:-1], np.diff(c.first)
         self.inertia, self.stiffness, self.length = c.mass * c.rotating, c.stiffness.copy(), c.length
         self.stiffness[c.first[1:] - 1] = 0.0  # no coupler behind the last unit
+        self.ours = ~p.roster.driven
 
     def initial(self) -> State:
         """Nothing seen yet."""
@@ -61,7 +64,7 @@ class Balance:
             accounted = row.extremes.energy @ SIGNS + s.kicked
             known = ~np.isnan(s.stored)  # neither the first row nor a train that has just come
             s.drift[known] += (now - s.stored - accounted)[known]
-            s.stored[:] = np.where(row.seen.present, now, np.nan)
+            s.stored[:] = np.where(row.seen.present & self.ours, now, np.nan)
             s.kicked[:] = 0.0
             s.turnover[known] += np.abs(row.extremes.energy).sum(axis=1)[known]
             out = np.abs(s.drift) > self.LIMIT * s.turnover + ROUNDING * now

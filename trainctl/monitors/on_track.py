@@ -128,7 +128,8 @@ class Watch:
 
 def of(p: Model) -> Watch:
     """The watch over the trains of a scenario."""
-    return Watch(p.scenario.ids, p.consists.train_length(), p.roster.speed_factor, p.rails, p.line, not p.placed, p.signs)
+    factor = np.where(p.roster.driven, np.inf, p.roster.speed_factor)  # SUMO's trains may exceed limits, as their types say
+    return Watch(p.scenario.ids, p.consists.train_length(), factor, p.rails, p.line, not p.placed, p.signs)
 
 
 def located(line: Line, net: bool, edge: int, place: float) -> dict[str, Any]:

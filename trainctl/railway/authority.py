@@ -36,7 +36,7 @@ class View(NamedTuple):
 
 def look(
     ways: Ways, net: along.Net, limit: Floats, factor: Floats, row: Ints, s: Floats, speed: Floats, length: Floats, present: Bools,
-    horizon: float, held: Floats, order: along.Order | None,
+    horizon: float, held: Floats, order: along.Order | None, at: int = SWITCH,
 ) -> View:  # fmt: skip
     """Look ahead along the ways of all trains.
 
@@ -58,6 +58,8 @@ def look(
         How far every front may go because what comes then is another train's turn [m]; inf: as far as it likes.
     order : Order, optional
         Turns that are decided, see ``interlocking.order``.
+    at : int
+        What trains are held at: place in ``supervisor.KINDS``.
 
     Returns
     -------
@@ -66,8 +68,8 @@ def look(
     """
     placed = along.places(ways, net, row, s, length, present, horizon, order)
     there = bodies(placed, virtual=False)
-    clear = _targets(there, held, speed, present)
-    targets = _targets(bodies(placed), held, speed, present) if len(placed.join_train) else clear
+    clear = _targets(there, held, speed, present, at)
+    targets = _targets(bodies(placed), held, speed, present, at) if len(placed.join_train) else clear
     room, body = np.full(len(row), np.inf), np.full(len(row), -1, np.int64)
     far_first = np.argsort(-there.room)
     real = far_first[(there.sense[far_first] != 0) & there.sure[far_first]]
@@ -76,7 +78,7 @@ def look(
     return View(along.ahead(placed), targets, clear, limits, room, body, fouling(placed))
 
 
-def _targets(body: Bodies, held: Floats, speed: Floats, present: Bools) -> Targets:
+def _targets(body: Bodies, held: Floats, speed: Floats, present: Bools, at: int) -> Targets:
     """Bodies in the way, and the places where trains are held.
 
     Who comes the other way beyond the place where a train is held turns off before, or is held itself.
@@ -89,7 +91,7 @@ def _targets(body: Bodies, held: Floats, speed: Floats, present: Bools) -> Targe
         room=np.concatenate([body.room[blocked], held[waits]]),
         speed=np.concatenate([np.where(kind == SWITCH, 0.0, speed[body.other[blocked]]), np.zeros(len(waits))]),
         moving=np.concatenate([kind != SWITCH, np.zeros(len(waits), bool)]),
-        kind=np.concatenate([kind, np.full(len(waits), SWITCH)]).astype(np.int64),
+        kind=np.concatenate([kind, np.full(len(waits), at)]).astype(np.int64),
         other=np.concatenate([body.other[blocked], np.full(len(waits), -1)]),
     )
 

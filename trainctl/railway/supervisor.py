@@ -56,8 +56,8 @@ from pydantic_core import PydanticCustomError
 from trainctl.signals import Bools, Floats, Ints, Table
 
 #: What can bind a train; ``Targets.kind`` and ``Verdict.reason`` are places in it. "limit" is of ``Limits`` only.
-KINDS = ("train", "opposing", "switch", "stop", "end", "limit")
-TRAIN, OPPOSING, SWITCH, STOP, END, LIMIT = range(6)
+KINDS = ("train", "opposing", "switch", "stop", "end", "signal", "limit")
+TRAIN, OPPOSING, SWITCH, STOP, END, SIGNAL, LIMIT = range(7)
 
 #: Farther than anything here [m]: stands for no bound in the sums.
 _FAR = 1e9
@@ -88,7 +88,7 @@ class Params(Table):
     service_mps2: float = Field(
         0.7, gt=0.0, description="Deceleration [m/s2] planned with before lower speed limits and stops; at most emergency_mps2."
     )
-    margin_m: float = Field(20.0, ge=0.0, description="Kept between a front and what it must not reach [m]; stops are reached.")
+    margin_m: float = Field(20.0, ge=0.0, description="Kept between a front and what it must not reach [m]; stops and signals are.")
     greatest_mps2: float = Field(1.0, gt=0.0, description="Maximum acceleration admitted [m/s2].")
     emergency_distance_m: float = Field(
         0.0, ge=0.0, description="Gap to another train [m] below which emergency braking is ordered whatever the speeds."
@@ -284,7 +284,7 @@ def _braking(params: Params, relied: Assumed, speed: Floats, now: Floats, target
     more = relied.drift + relied.surge + relied.lag * np.maximum(now + relied.braking + relied.scatter, 0.0)
     v, b = speed[i] + np.where(stop, relied.drift[i], more[i]), relied.braking[i]  # the room to a stop counts the lag already
     own = stopping_distance(v, b, step, theta)
-    margin: Floats | float = params.margin_m
+    margin: Floats | float = np.where(targets.kind == SIGNAL, 0.0, params.margin_m)
     if relied.uncertainty.any():
         margin = margin + relied.uncertainty[i] + np.where(j >= 0, relied.uncertainty[j], 0.0)
     room = np.minimum(targets.room, _FAR) - np.where(stop, 0.0, margin)

@@ -39,7 +39,7 @@ from trainctl.record.recorder import sync
 from trainctl.record.sums import PIECE, verify
 from trainctl.scenario.model import Model
 from trainctl.signals import Floats, Ints, Links, Seen, Start
-from trainctl.world import World
+from trainctl.world import SignalBox, World
 
 if TYPE_CHECKING:
     from trainctl.loop import Loop
@@ -87,14 +87,13 @@ class Tape:
 
     def __init__(self, world: World, folder: Path, saved: Saved | None = None) -> None:
         self.world, self.path = world, folder / MOVES
-        told: dict[str, Any] = (
-            saved.values["tape"]
-            if saved
-            else {"steps": 0, "trains": 0, "crc": 0, "routes": [], "entries": [], "parked": [], "turns": []}
-        )
+        none: dict[str, Any] = {
+            "steps": 0, "trains": 0, "crc": 0, "routes": [], "entries": [], "parked": [], "halted": [], "turns": [],
+        }  # fmt: skip
+        told = saved.values["tape"] if saved else none
         self.steps, self.trains, self.crc = told["steps"], told["trains"], told["crc"]
         self.routes, self.entries, self.parked = list(told["routes"]), list(told["entries"]), list(told["parked"])
-        self.turns = list(told["turns"])
+        self.halted, self.turns = list(told["halted"]), list(told["turns"])
         self.buffer = bytearray()
         size = 8 * self.steps * self.trains
         if saved:
@@ -107,7 +106,8 @@ class Tape:
 
     def replay(self, step: float) -> None:
         """Tell the world, which has just started, everything once more."""
-        routes, entries, parked, turns = (_by_step(told) for told in (self.routes, self.entries, self.parked, self.turns))
+        told = (self.routes, self.entries, self.parked, self.halted, self.turns)
+        routes, entries, parked, halted, turns = (_by_step(one) for one in told)
         rows = max(1, PIECE // (8 * max(self.trains, 1)))
         with self.path.open("rb") as file:
             for k in range(self.steps):
@@ -119,6 +119,8 @@ class Tape:
                     self.world.insert(train, speed)
                 for train, off in parked.get(k, ()):
                     self.world.park(train, off)
+                for train, stands in halted.get(k, ()):
+                    self.world.halt(train, stands)
                 for train, (edges, arrival) in turns.get(k, ()):
                     self.world.turn(train, tuple(edges), np.inf if arrival is None else arrival)
                 self.world.move(piece[k % rows].copy(), step)
@@ -152,6 +154,16 @@ class Tape:
         self.turns.append((self.steps, train, [list(edges), None if np.isinf(arrival) else arrival]))
         self.world.turn(train, edges, arrival)
 
+    def halt(self, train: int, stands: bool) -> None:
+        """Say that a train stands at a stop, or goes on."""
+        self.halted.append((self.steps, train, stands))
+        self.world.halt(train, stands)
+
+    @property
+    def box(self) -> SignalBox | None:
+        """Who sets the signals."""
+        return self.world.box
+
     @property
     def ways(self) -> Ways:
         """Ways of all trains as they are now ordered."""
@@ -180,7 +192,7 @@ class Tape:
         """Everything told until now, safe on the disk, as a checkpoint names it."""
         self._flush()
         os.fsync(self.file.fileno())
-        told = {"routes": self.routes, "entries": self.entries, "parked": self.parked, "turns": self.turns}
+        told = {"routes": self.routes, "entries": self.entries, "parked": self.parked, "halted": self.halted, "turns": self.turns}
         return {"steps": self.steps, "trains": self.trains, "crc": self.crc, **told}
 
     def close(self) -> None:

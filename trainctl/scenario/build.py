@@ -23,7 +23,7 @@ from trainctl.scenario.model import Model
 from trainctl.scenario.plan import initial, plan_of
 from trainctl.scenario.reading import examine, mistakes, read
 from trainctl.scenario.reference import Profile
-from trainctl.scenario.tables import Scenario
+from trainctl.scenario.tables import Network, Scenario
 from trainctl.signals import POSITION
 from trainctl.topology import graph
 
@@ -39,7 +39,7 @@ def open_scenario(name: str, overrides: dict[str, Any] | None = None) -> Model:
     data, path = read(name, overrides)
     scenario, found = examine(data)
     if scenario is None:
-        raise InputError([f"{path.name}: {line}" for line in found])
+        raise InputError([f"{path.name}: {line}" for line in dict.fromkeys([*found, *further(data, path.parent)])])
     return model_of(scenario, path.name, path.parent, found)
 
 
@@ -98,7 +98,7 @@ def model_of(
         network = beside.line, beside.spec, beside.net
     else:
         signals_m = partial(law.signals_m, params) if params is not None and hasattr(law, "signals_m") else None
-        network = attempt(_network, scenario, folder, signals_m)
+        network = attempt(_network, scenario.network, folder, signals_m)
     plan = attempt(plan_of, scenario)
     misplaced = placing.on_the_line(scenario, network[0]) if network is not None and trains is None else []
     found += misplaced
@@ -166,9 +166,38 @@ def _params(model: Any, keys: dict[str, Any], table: str) -> Any:
         raise InputError(mistakes(error, keys, table, model)) from None
 
 
-def _network(scenario: Scenario, folder: Path, signals_m: Callable[[float | None], float] | None) -> tuple[Line, Any, Path | None]:
+def further(data: dict[str, Any], folder: Path) -> list[str]:
+    """What else is wrong where the tables themselves are: names of law, observer and plant, their keys, network, places on it."""
+    found: list[str] = []
+    for table, key, find in (("controller", "law", partial(find_law, folder=folder)), ("observer", "kind", find_observer),
+                             ("plant", "kind", find_plant)):  # fmt: skip
+        said = data.get(table)
+        if isinstance(said, dict) and isinstance(said.get(key), str):
+            keys = json.loads(json.dumps({k: v for k, v in said.items() if k != key}, default=str))
+            try:
+                _params(find(said[key]).Params, keys, table)
+            except InputError as error:
+                found += error.mistakes
+    try:
+        network = Network.model_validate(data.get("network"))
+        line = _network(network, folder, None)[0] if network.sumocfg is None else None
+    except ValidationError:  # told already
+        return found
+    except InputError as error:
+        return [*found, *error.mistakes]
+    except LineError as error:
+        return [*found, *(f"network: {m}" for m in error.mistakes)]
+    trains = data.get("train")
+    for number, train in enumerate(trains if isinstance(trains, list) and line is not None else (), 1):
+        if isinstance(train, dict):
+            place, track = train.get("position_m", 0.0), train.get("track")
+            known = isinstance(place, int | float) and isinstance(track, int | str)
+            found += placing.off_the_line(f"train[{train.get('id', number)}]", str(track), place, line) if known and line else []
+    return found
+
+
+def _network(network: Network, folder: Path, signals_m: Callable[[float | None], float] | None) -> tuple[Line, Any, Path | None]:
     """The line, its description and its net; ``signals_m`` is how far apart the law wants signals, from what the line states."""
-    network = scenario.network
     if network.net is not None:
         path = folder / network.net
         return Line.read(path), None, path

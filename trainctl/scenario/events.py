@@ -14,10 +14,11 @@ from trainctl.signals import Table
 class Event(Table):
     """[[event]]: something that happens at a time or place."""
 
-    kind: Literal["reroute", "brake"] = Field(
-        description="reroute: the train takes a crossover to another track and stays there. brake: it brakes on its own."
+    kind: Literal["reroute", "brake", "outage"] = Field(
+        description="reroute: the train takes a crossover to another track and stays there. brake: it brakes on its own. outage: "
+        "its radio neither sends nor hears."
     )
-    train: Id = Field(description="The train.")
+    train: Id = Field(description="The train; an outage may be of all.")
     crossover: str | None = Field(
         None, description="Id of the crossover (see `trainctl net show`); default: the next one to to_track."
     )
@@ -29,7 +30,7 @@ class Event(Table):
         None, description="brake: so hard, as far as its plant can [m/s2]; default full braking, [supervisor] emergency_mps2."
     )
     until_s: Positive | None = Field(
-        None, description="brake: from then on its law drives it again [s]; default never, it stands in the end."
+        None, description="brake: from then on its law drives it again [s], default never; outage: when it is over [s]."
     )
     time_s: NotNegative = Field(
         0.0, description="When it is ordered at the earliest [s]; a train that is rerouted changes track when it gets there."
@@ -40,15 +41,23 @@ class Event(Table):
 
     @model_validator(mode="after")
     def _of_its_kind(self) -> Event:
-        ways = [key for key in ("crossover", "to_track", "to_edge") if getattr(self, key) is not None]
-        brakes = [key for key in ("deceleration_mps2", "until_s") if getattr(self, key) is not None]
-        if self.kind == "reroute" and len(ways) != 1:
-            raise ValueError("give exactly one of crossover, to_track, to_edge")
-        if strange := brakes if self.kind == "reroute" else ways:
+        ways, conditions = ("crossover", "to_track", "to_edge"), ("position_m", "gap_below_m", "speed_below_mps")
+        given = [key for key in (*ways, *conditions, "deceleration_mps2", "until_s") if getattr(self, key) is not None]
+        known = {"reroute": (*ways, *conditions), "brake": (*conditions, "deceleration_mps2", "until_s"), "outage": ("until_s",)}
+        if strange := [key for key in given if key not in known[self.kind]]:
             raise ValueError(f"{', '.join(strange)}: not with kind = {self.kind}")
+        if self.kind == "reroute" and len([key for key in given if key in ways]) != 1:
+            raise ValueError("give exactly one of crossover, to_track, to_edge")
+        if self.kind == "outage" and self.until_s is None:
+            raise ValueError("an outage needs until_s")
         if self.until_s is not None and self.until_s <= self.time_s:
             raise ValueError(f"until_s = {self.until_s:g}: must be after time_s = {self.time_s:g}")
         return self
+
+    @property
+    def of_all(self) -> bool:
+        """Whether it is of all trains."""
+        return self.kind == "outage" and self.train == "all"
 
 
 class Order(Table):

@@ -68,20 +68,18 @@ def fits(p: Model) -> list[str]:
 
 def _messages_fit(p: Model) -> list[str]:
     """Exchange periods, loss and delay against the law's clock."""
-    run, top = p.scenario.run, p.scenario.topology
+    run, top, channel = p.scenario.run, p.scenario.topology, p.scenario.channel
     period = top.communication_period_s
+    short = channel.too_short(period or run.control_period_s or run.step_s)
     if p.sampled:
-        return (
-            []
-            if period is None
-            else ["topology.communication_period_s: sampled laws exchange once per control period; leave it out"]
-        )
+        strange = "topology.communication_period_s: sampled laws exchange once per control period; leave it out"
+        return short + ([] if period is None else [strange])
     if period is None:
-        return (
-            ["topology.communication_period_s: missing; loss and delay need messages sent at instants"]
-            if top.loss + top.delay_s > 0
-            else []
-        )
+        outage = any(event.kind == "outage" for event in p.scenario.event)
+        instants = "topology.communication_period_s: missing; loss, delay and the channel need messages sent at instants"
+        return [instants] if top.loss + top.delay_s > 0 or outage or not channel.usual else []
+    if short:
+        return short
     ratio = run.step_s / period
     if min(abs(ratio - round(ratio)), abs(1 / ratio - round(1 / ratio))) > 1e-9:
         return [f"topology.communication_period_s = {period:g}: must divide step_s = {run.step_s:g} or be a multiple of it"]

@@ -20,6 +20,7 @@ from trainctl.railway import signs, supervisor
 from trainctl.railway.authority import DRIVER_MARGIN_M
 from trainctl.railway.signs import Signs
 from trainctl.scenario import limits, promise
+from trainctl.scenario.channel import exchanges
 from trainctl.scenario.tables import Scenario, TrafficTable
 from trainctl.signals import (
     POSITION,
@@ -107,8 +108,9 @@ class Model:
         if "emergency_mps2" not in stated.model_fields_set:
             v = self.fastest
             brakes = resistance(v, self.consists.train_davis()) - self.bounds.input_lower
+            ours = self.sure_braking[~self.roster.driven].min(initial=np.inf)
             wanted = math.ceil(1000.0 * max([stated.emergency_mps2, *brakes[np.isfinite(brakes)]])) / 1000.0
-            known["emergency_mps2"] = min(wanted, float(np.floor(1000.0 * self.sure_braking.min())) / 1000.0)
+            known["emergency_mps2"] = min(wanted, float(np.floor(1000.0 * ours)) / 1000.0)
             known["service_mps2"] = min(stated.service_mps2, known["emergency_mps2"])
         return stated.model_copy(update=known)
 
@@ -153,6 +155,11 @@ class Model:
     def self_driven(self) -> bool:
         """Whether the simulator drives the trains by itself: no law of ours, and no plant."""
         return bool(self.law.CLOCK == "none")
+
+    @property
+    def obeys(self) -> bool:
+        """Whether trains obey the rail signals of their net, and SUMO perhaps drives some of them."""
+        return self.roster.handed is not None
 
     @property
     def has_units(self) -> bool:
@@ -211,7 +218,14 @@ class Model:
         period = top.communication_period_s or run.control_period_s or run.step_s
         names = np.array([draws.word(name) for name in self.scenario.ids], np.int64)
         key = np.tile(np.array(draws.key(run.seed or 0), np.int64), (len(names), 1))
-        return Radio(top.loss, round(top.delay_s / period), top.range_m or np.inf, key, names)
+        c, of = self.scenario.channel, {name: i for i, name in enumerate(self.scenario.ids)}
+        outages = [(of.get(e.train, -1), e.time_s, e.until_s) for e in self.scenario.event if e.kind == "outage"]
+        return Radio(
+            top.loss, round(top.delay_s / period), top.range_m or np.inf, key, names, 1.0 if c.bad_loss is None else c.bad_loss,
+            period / c.good_s if c.good_s else 0.0, period / c.bad_s if c.bad_s else 1.0, c.delay_spread_s / period,
+            c.delay_shape == "exponential", -1.0 if c.send_beyond_m is None else c.send_beyond_m,
+            exchanges(c.send_every_s or 0.0, period), np.array(outages, np.float64).reshape(-1, 3),
+        )  # fmt: skip
 
     @property
     def spacing(self) -> convoys.Spacing:

@@ -133,18 +133,22 @@ def _rules_on_slopes(p: Model) -> list[str]:
     return [f"{rule} ({slopes})" for rule in p.law.violations(p.params, scene._replace(bounds=left))]
 
 
+def off_the_line(here: str, track: str, position: float, line: Line) -> list[str]:
+    """Track and front [m] of a train that are not on the line; ``here`` is its key."""
+    found = [] if track in line.track_ids else [f"{here}.track = {track}: no such track; there are: {', '.join(line.track_ids)}"]
+    if not line.begin_m <= position <= line.end_m:
+        found.append(f"{here}.position_m = {position:.10g}: off the line, which is {line.begin_m:.10g} .. {line.end_m:.10g} m")
+    return found
+
+
 def on_the_line(scenario: Scenario, line: Line) -> list[str]:
     """Trains beside the line or inside one another, crossovers that do not exist or are behind."""
     found, placed = [], []
     for t in scenario.train:
         here = f"train[{t.id}]"
-        if t.track not in line.track_ids:
-            found.append(f"{here}.track = {t.track}: no such track; there are: {', '.join(line.track_ids)}")
-        elif not line.begin_m <= t.position_m <= line.end_m:
-            found.append(
-                f"{here}.position_m = {t.position_m:.10g}: off the line, which is {line.begin_m:.10g} .. {line.end_m:.10g} m"
-            )
-        else:
+        beside = off_the_line(here, t.track, t.position_m, line)
+        found += beside
+        if not beside:
             kind = scenario.train_type[t.type]
             length = math.fsum(kind.per_unit("unit_length_m"))
             if t.position_m - length < line.begin_m:
@@ -161,8 +165,10 @@ def on_the_line(scenario: Scenario, line: Line) -> list[str]:
             )
     where = {t.id: (t.track, t.position_m, t) for t in scenario.train}
     for k, event in sorted(enumerate(scenario.event, 1), key=lambda e: e[1].time_s):
+        if event.kind != "reroute":
+            continue
         track, at_least, t = where[event.train]
-        if event.kind == "reroute" and track in line.track_ids:
+        if track in line.track_ids:
             where[event.train] = (*_reroute(f"event[{k}]", event, scenario, line, track, at_least, found), t)
     return found
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import fnmatch
 import math
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,11 +15,14 @@ from sumo_net import Line, LineError, Rails
 from sumo_net.layout import Gradient
 from trainctl.errors import InputError
 from trainctl.railway import turning
-from trainctl.scenario import passages
+from trainctl.scenario import mixed, passages
 from trainctl.scenario.tables import Scenario, TrafficTable, Train, TrainType
 from trainctl.scenario.train_types import fitted, train_type
 from trainctl.signals import Bools, Floats, Ints
 from trainctl.traffic.closings import Closing
+from trainctl.traffic.handed import Handed, handed, read_back
+from trainctl.traffic.known import of_signals
+from trainctl.traffic.rail_signals import Signal
 from trainctl.traffic.read import Configuration, Departure, read_traffic
 
 #: Name of the [train_type] of all vTypes without data of their own.
@@ -70,6 +73,9 @@ class Roster(NamedTuple):
     signs: tuple[tuple[float, str, float], ...]  # variable speed signs: from when on [s], edge, limit [m/s]
     closings: tuple[Closing, ...]  # edges closed for a time, round which trains are led
     source: str  # the SUMO configuration; "" for [[train]] tables
+    driven: Bools  # (n,) SUMO drives these itself
+    signals: tuple[Signal, ...]  # rail signals of the net, where they are obeyed
+    handed: Handed | None  # what SUMO is handed of the files: signals are obeyed; None: they are not
     rails: Rails
     placed: bool  # by [[train]] tables, all there from the start; else they come and go
 
@@ -101,8 +107,8 @@ def placed(scenario: Scenario, line: Line, rails: Rails | None = None) -> Roster
         arrival=np.full(n, np.inf), speed=np.array([t.speed_mps for t in scenario.train], float), like=("",) * n,
         top_speed=np.full(n, np.inf), speed_factor=np.ones(n),
         legs=tuple((line.route(t.track, t.position_m),) for t in scenario.train), stops=((),) * n, cooperates=np.ones(n, bool),
-        vclass=("rail",) * n, patience=np.inf, notes=(), signs=(), closings=(), source="", placed=True,
-        rails=Rails.of(line) if rails is None else rails,
+        vclass=("rail",) * n, patience=np.inf, notes=(), signs=(), closings=(), source="", driven=np.zeros(n, bool), signals=(),
+        handed=None, placed=True, rails=Rails.of(line) if rails is None else rails,
     )  # fmt: skip
 
 
@@ -134,6 +140,9 @@ def from_tables(data: Mapping[str, Any], net: Path) -> Roster:
             for at, closed, begin, end, share, types, classes in data["closings"]
         ),
         source=str(data["source"]),
+        driven=np.array(data["driven"], bool),
+        signals=tuple(Signal(*one) for one in data["signals"]),
+        handed=None if data["handed"] is None else read_back(data["handed"]),
         rails=Rails.read(net, {e for legs in data["legs"] for leg in legs for e in leg}),
         placed=False,
     )
@@ -175,21 +184,31 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         rails = Rails.read(traffic.net, {e for d in traffic.departures for e in d.edges})
     except LineError as error:
         raise InputError([f"network.sumocfg: {m}" for m in error.mistakes]) from None
-    types, found = _types(scenario, traffic)
     driving = scenario.traffic or TrafficTable()
     ids = [d.id for d in traffic.departures]
     together = np.array([any(fnmatch.fnmatchcase(i, p) for p in driving.cooperate) for i in ids], bool)
+    driven = ~together & (driving.others == "sumo" and scenario.controller.law != "sumo")
+    types, found = _types(
+        scenario, traffic, {d.kind for d, other in zip(traffic.departures, driven.tolist(), strict=True) if not other}
+    )
     found += [
         f"traffic.cooperate = {p}: no train of that name; there are: {', '.join(ids[:8])}{' ...' if len(ids) > 8 else ''}"
         for p in driving.cooperate
         if not any(fnmatch.fnmatchcase(i, p) for i in ids)
     ]
     found += _events(scenario, ids, rails)
+    found += [
+        f"event[{k}]: train {event.train} is SUMO's own and takes no orders: traffic.others = sumo"
+        for k, event in enumerate(scenario.event, 1)
+        if event.train in ids and driven[ids.index(event.train)]
+    ]
     trains, routes, stops, arrival = list[Train](), list[tuple[tuple[str, ...], ...]](), list[tuple[Stop, ...]](), list[float]()
     factor = np.array([min(traffic.kinds[d.kind].speed_factor, 1.0) for d in traffic.departures])
-    for d, share in zip(traffic.departures, factor.tolist(), strict=True):
+    for d, share, other in zip(traffic.departures, factor.tolist(), driven.tolist(), strict=True):
         try:
-            parts = [np.array(leg, np.int64) for leg in turning.legs(rails.way(d.edges).tolist(), rails.reversal)]
+            # Trains of SUMO's own turn by themselves.
+            cuts = frozenset() if other else rails.reversal
+            parts = [np.array(leg, np.int64) for leg in turning.legs(rails.way(d.edges).tolist(), cuts)]
             begins = [rails.start_m[w[0]] + np.concatenate([[0.0], np.cumsum(rails.length_m[w[:-1]])]) for w in parts]
             way, begin = parts[-1], begins[-1]
             there = float(rails.length_m[way[-1]]) if d.arrival_m is None else d.arrival_m
@@ -218,6 +237,21 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
             scenario.order, dict(zip(ids, whole, strict=True)),
             {rails.edges[e]: rails.edges[f] for e, f in enumerate(rails.twin.tolist()) if f >= 0},
         )  # fmt: skip
+    given, told = None, list[str]()
+    if not found and scenario.controller.law != "sumo":
+        bare = mixed.unguarded([rails.way(d.edges) for d in traffic.departures], ids, rails, traffic.signals)
+        choice, told, wrong = mixed.chosen(driving, together, traffic.signals, bare)
+        found += wrong
+        if choice == "obey":
+            scenario = scenario.model_copy(update={"traffic": driving.model_copy(update={"signals": "obey"})})
+            own = [ids[i] for i in np.flatnonzero(driven).tolist()]
+            given = handed(traffic.source, ids, own, traffic.begin_s)
+            ways, trips = dict(zip(ids, whole, strict=True)), dict(zip(ids, given.trips, strict=True))
+            ordered, wrong = mixed.constraints(scenario.order, ways, trips, rails, traffic.signals)
+            given = given._replace(additional=(*given.additional, *ordered))
+            found += wrong
+        else:
+            told += of_signals(traffic.junctions, traffic.source.options, traffic.source.elements.others)
     if found:
         raise InputError(list(dict.fromkeys(found)))
     departures = traffic.departures
@@ -239,12 +273,16 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         if scenario.controller.law == "sumo"
         else (
             *traffic.notes,
+            *told,
             *fitted(kind for name, kind in traffic.kinds.items() if name not in scenario.train_type),
             *_slower(scenario, traffic, rails, whole),
         ),
         closings=tuple(c._replace(begin=c.begin - traffic.begin_s, end=c.end - traffic.begin_s) for c in traffic.closings),
         source=str((folder / str(scenario.network.sumocfg)).resolve()),
         signs=tuple((t - traffic.begin_s, edge, v) for t, edge, v in traffic.signs),
+        driven=driven,
+        signals=traffic.signals if given is not None else (),
+        handed=given,
         rails=rails,
         placed=False,
     )
@@ -267,18 +305,23 @@ def _events(scenario: Scenario, ids: list[str], rails: Rails) -> list[str]:
     edges = [edge for edge, inside in zip(rails.edges, rails.internal, strict=True) if not inside]
     for k, event in enumerate(scenario.event, 1):
         for key, name, known, what in (("train", event.train, ids, "train"), ("to_edge", event.to_edge, edges, "edge for trains")):
-            if name is not None and name not in known:
+            if name is not None and name not in known and not (key == "train" and event.of_all):
                 some = f"{', '.join(known[:8])}{' ...' if len(known) > 8 else ''}"
                 found.append(f"event[{k}].{key} = {name}: no such {what}; there are: {some}")
     return found
 
 
-def _types(scenario: Scenario, traffic: Configuration) -> tuple[dict[str, TrainType], list[str]]:
-    """Data of every vType that runs: the scenario's own, else what the vType says of itself."""
+def _types(scenario: Scenario, traffic: Configuration, ours: Collection[str]) -> tuple[dict[str, TrainType], list[str]]:
+    """Data of every vType that runs: the scenario's own, else what the vType says of itself.
+
+    A type that is none of ``ours`` moves nobody here: where it lacks data those of another one stand for it.
+    """
     types, found = {name: kind for name, kind in scenario.train_type.items() if name != REST}, []
-    for name in dict.fromkeys(d.kind for d in traffic.departures):
+    for name in sorted(dict.fromkeys(d.kind for d in traffic.departures), key=lambda name: name not in ours):
         if name not in types:
             kind = train_type(traffic.kinds[name], scenario.train_type.get(REST))
+            if isinstance(kind, list) and name not in ours and (like := next(iter(types.values()), None)) is not None:
+                kind = train_type(traffic.kinds[name], like)
             if isinstance(kind, list):
                 found += kind
             else:

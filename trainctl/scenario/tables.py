@@ -15,6 +15,7 @@ from trainctl.laws import moves_points
 from trainctl.plants.disturbance import Disturbance
 from trainctl.plants.faults import Fault
 from trainctl.railway.supervisor import Params as Supervisor
+from trainctl.scenario.channel import Channel
 from trainctl.scenario.events import Event, Order
 from trainctl.scenario.keys import Id, NotNegative, PerUnit, Positive
 from trainctl.scenario.reference import Profile
@@ -102,6 +103,15 @@ class TrafficTable(Table):
 
     cooperate: tuple[str, ...] = Field(
         ("*",), description="Trains that join formations, by id; * stands for anything. The others are driven by themselves."
+    )
+    others: Literal["driven", "sumo"] = Field(
+        "driven",
+        description="Trains that do not cooperate: driven: by our driver, on our plants; sumo: by SUMO, with their own vTypes.",
+    )
+    signals: Literal["ignore", "obey"] | None = Field(
+        None,
+        description="Rail signals of the net: obey: they decide who goes first; ignore: our own interlocking does. Default: obey"
+        " where there are some and not every train cooperates, or SUMO drives some of them.",
     )
     acceleration_mps2: Positive = Field(0.4, description="Acceleration of a train or formation that is driven [m/s2].")
     deceleration_mps2: Positive = Field(0.5, description="Braking for limits, stops and trains ahead, positive [m/s2].")
@@ -327,6 +337,7 @@ class Scenario(Table):
     reference: Profile
     bounds: BoundsTable = BoundsTable()
     topology: Topology = Topology()
+    channel: Channel = Channel()
     supervisor: Supervisor | None = Field(None, description="Protection; default: off, on with network.sumocfg.")
     traffic: TrafficTable | None = Field(None, description="Only with network.sumocfg.")
     train_type: dict[str, TrainType] = Field({}, description="With network.sumocfg: by the ids of its vTypes.")
@@ -336,6 +347,9 @@ class Scenario(Table):
     order: tuple[Order, ...] = ()
     disturbance: tuple[Disturbance, ...] = ()
     fault: tuple[Fault, ...] = ()
+    alternative: dict[str, dict[str, Any]] = Field(
+        {}, description="Keys of [controller] for rows of `trainctl compare NAME --controllers all`, by the name of the row."
+    )
 
     @field_validator("train")
     @classmethod
@@ -372,10 +386,12 @@ class Scenario(Table):
         for k, link in enumerate(self.link, 1):
             found += [f"link[{k}]: train {i} does not exist; there are: {', '.join(ids)}" for i in link.ends if i not in ids]
         for k, event in enumerate(self.event, 1):
-            if event.train not in ids:
+            if event.train not in ids and not event.of_all:
                 found.append(f"event[{k}].train = {event.train}: no such train; there are: {', '.join(ids)}")
         if self.topology.loss > 0 and self.run.seed is None:
             found.append(f"topology.loss = {self.topology.loss:g}: losses are random, so the run needs [run] seed")
+        if (key := self.channel.random) and self.run.seed is None:
+            found.append(f"channel.{key} = {getattr(self.channel, key):g}: the channel is random, so the run needs [run] seed")
         for name in sorted({t.type for t in self.train if t.type in types}):
             found += self.plant.too_many(name, types[name])
         return found

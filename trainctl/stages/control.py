@@ -74,7 +74,9 @@ class Control:
             memory = law.initial(p.params, p.scene(own, formed.links, t))
         sent = law.message(formed.constants, trains, leader, *((memory,) if p.remembers else ()))
         number = k // p.scenario.run.held_steps
-        messages, heard = exchange.deliver(self.radio, messages, sent, trains.position, formed.links, number)
+        messages, heard = exchange.deliver(
+            self.radio, messages, sent, trains.position, formed.links, number, t, trains.position - leader[POSITION]
+        )
         links = formed.links._replace(heard=heard)
         if p.remembers:
             demand, memory = law.demand(formed.constants, trains, leader, links, messages.heard, memory)

@@ -12,7 +12,7 @@ import numpy as np
 
 from trainctl.railway import along
 from trainctl.railway.authority import View
-from trainctl.railway.supervisor import SWITCH
+from trainctl.railway.supervisor import SIGNAL, SWITCH
 from trainctl.scenario.model import Model
 from trainctl.signals import POSITION, SPEED, Bools, Floats, Formed, Ints, Links, Pace, Reference, Seen, restrict
 from trainctl.stages.record import Journal
@@ -71,7 +71,7 @@ class Convoys:
         p, view, before = self.p, around.view, formed.ahead
         asks = _Asking(s, formed, own.copy())
         held = np.zeros(self.n, bool)
-        held[view.targets.train[(view.targets.kind == SWITCH) & ~view.targets.moving]] = True
+        held[view.targets.train[np.isin(view.targets.kind, (SWITCH, SIGNAL)) & ~view.targets.moving]] = True
         willing = seen.present & self.roster.cooperates & ~traffic.stopping & ~traffic.standing & ~held
         for i in convoys.broken(asks.ahead, view.ahead.train, willing).tolist():
             j = int(asks.ahead[i])

@@ -34,7 +34,7 @@ class State(NamedTuple):
 
     pending: tuple[int, ...]  # their numbers
     given: list[dict[str, Any]]  # all that came from outside, as tables; their numbers follow those of the scenario
-    braking: tuple[int, ...] = ()  # orders to brake that act
+    acting: tuple[int, ...] = ()  # orders to brake, and outages, that act
 
 
 class Orders:
@@ -43,6 +43,7 @@ class Orders:
     def __init__(self, p: Model, journal: Journal) -> None:
         self.p, self.journal = p, journal
         self.length = p.consists.train_length()
+        self.index = {name: i for i, name in enumerate(p.scenario.ids)}
         self.theta = p.step_theta
 
     def initial(self) -> State:
@@ -51,7 +52,7 @@ class Orders:
 
     def added(self, event: Event, s: State) -> State:
         """One more order, from outside."""
-        if event.train not in self.p.scenario.ids:
+        if event.train not in self.index:
             raise ValueError(f"train {event.train}: no such train; there are: {', '.join(self.p.scenario.ids)}")
         given = [*s.given, event.model_dump(mode="json", exclude_none=True)]
         return s._replace(pending=(*s.pending, len(self.p.scenario.event) + len(given)), given=given)
@@ -87,12 +88,12 @@ class Orders:
         """
         found: list[tuple[int, tuple[str, ...]]] = []
         due = [number for number in s.pending if self._is_due(t, self._event(number, s), seen, speed, ahead)]
-        s = self._braking(t, s, [number for number in due if self._event(number, s).kind == "brake"])
+        s = self._acting(t, s, [number for number in due if self._event(number, s).kind != "reroute"])
         for number in due:
             event = self._event(number, s)
-            if event.kind == "brake":
+            if event.kind != "reroute":
                 continue
-            i = self.p.scenario.ids.index(event.train)
+            i = self.index[event.train]
             lock = float(supervisor.stopping_distance(
                 np.maximum(speed[i : i + 1], 0.0), self.p.supervision.service_mps2, self.p.scenario.run.step_s, self.theta
             )[0])  # fmt: skip
@@ -116,15 +117,17 @@ class Orders:
             found.append((i, edges))
         return s._replace(pending=tuple(number for number in s.pending if number not in due)) if due else s, found
 
-    def _braking(self, t: float, s: State, due: list[int]) -> State:
-        """Orders to brake that begin, and those whose time is over."""
-        over = [number for number in s.braking if (self._event(number, s).until_s or np.inf) <= t + 1e-9]
+    def _acting(self, t: float, s: State, due: list[int]) -> State:
+        """Orders to brake and outages that begin, and those whose time is over."""
+        over = [number for number in s.acting if (self._event(number, s).until_s or np.inf) <= t + 1e-9]
         for number in over:
-            self.journal.event(t, "brake_released", train=self._event(number, s).train)
+            event = self._event(number, s)
+            self.journal.event(t, "brake_released" if event.kind == "brake" else "outage_over", train=event.train)
         for number in due:
             event = self._event(number, s)
-            self.journal.event(t, "brake", train=event.train, deceleration_mps2=self._deceleration(event))
-        return s._replace(braking=tuple(number for number in (*s.braking, *due) if number not in over)) if over or due else s
+            more = {"deceleration_mps2": self._deceleration(event)} if event.kind == "brake" else {}
+            self.journal.event(t, event.kind, train=event.train, **more)
+        return s._replace(acting=tuple(number for number in (*s.acting, *due) if number not in over)) if over or due else s
 
     def _deceleration(self, event: Event) -> float:
         return event.deceleration_mps2 or self.p.supervision.emergency_mps2
@@ -135,17 +138,20 @@ class Orders:
         Within a step it comes to a stand at most: ``speed`` (n,) [m/s] is that of every train now.
         """
         found = np.full(len(speed), np.nan)
-        for number in s.braking:
+        for number in s.acting:
             event = self._event(number, s)
-            i = self.p.scenario.ids.index(event.train)
-            found[i] = np.fmin(found[i], -self._deceleration(event))
+            if event.kind == "brake":
+                i = self.index[event.train]
+                found[i] = np.fmin(found[i], -self._deceleration(event))
         ordered: Floats = np.maximum(found, -np.maximum(speed, 0.0) / self.p.scenario.run.step_s)
         return ordered
 
     def _is_due(self, t: float, event: Event, seen: Seen, speed: Floats, ahead: Ints) -> bool:
         if event.time_s > t + 1e-9:
             return False
-        i = self.p.scenario.ids.index(event.train)
+        if event.kind == "outage":
+            return True
+        i = self.index[event.train]
         if not seen.present[i]:
             return False
         if event.position_m is not None and seen.position[i] < event.position_m:

@@ -373,7 +373,9 @@ class Units:
         first, sent = self.p.consists.first, state.work.sent
         live = air._replace(live=True) if first_time else air
         integrate.exchange(self.parts, loop, first, links, references, live, t, own, state.estimate, state.work)
-        messages, _ = exchange.deliver(self.radio, messages, sent.copy(), own[self.p.leading, POSITION], links, number)
+        position = own[self.p.leading, POSITION]
+        place = position - references.leader(t)[POSITION]
+        messages, _ = exchange.deliver(self.radio, messages, sent.copy(), position, links, number, t, place)
         fresh = ~messages.ever
         messages.heard[fresh] = sent[links.sender[fresh]]
         return messages, air._replace(heard=messages.heard.copy(), sent_at=t)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trainctl.monitors import waiting
-from trainctl.railway import along, authority, interlocking, signs, supervisor, zones
+from trainctl.railway import along, aspects, authority, interlocking, signs, supervisor, zones
 from trainctl.railway.authority import DRIVER_MARGIN_M, View
 from trainctl.railway.interlocking import Held
 from trainctl.railway.ways import Ways, moved
@@ -25,6 +25,9 @@ STANDS_MPS, STOP_BAND_M = 0.05, 2.0
 
 #: A train enters if it can do so with this share of its speed.
 ENTERS_WITH = 0.8
+
+#: Farther than anything here [m].
+FAR_M = 1e9
 
 #: Trains that must slow down, stop or wait within this time do not couple before [s].
 SOON_S = 60.0
@@ -118,12 +121,13 @@ class Traffic:
         )  # fmt: skip
 
     def step(
-        self, t: float, ways: Ways, seen: Seen, speed: Floats, overrun: Floats, s: State, last: bool = False
-    ) -> tuple[State, Around]:
+        self, t: float, ways: Ways, seen: Seen, speed: Floats, overrun: Floats, s: State, last: bool = False,
+        red: Held | None = None,
+    ) -> tuple[State, Around]:  # fmt: skip
         """Arrivals, stops, entries; ``overrun`` (n,) is how much farther trains run than their brakes promise [m].
 
         Who is due at the end of the coming step is let in now, and is there then: in time. ``speed`` (n,) gets the speeds of trains
-        that enter; at the ``last`` instant of a run nobody does.
+        that enter; at the ``last`` instant of a run nobody does. ``red`` is how far signals let everybody go, where they decide.
         """
         s = self.departures(t, seen, speed, self.arrivals(t, seen, s))
         if not self.looks:
@@ -138,12 +142,10 @@ class Traffic:
         if last:
             self._uncalled(s)
         asking, reach = [] if last else [*self._returning(later, s), *self.due(later, s)], self._reach(speed)
-        s, held, entries, kept_out = self.entering(t, ways, s.on_track(seen), speed, s, asking, reach)
+        s, held, entries, kept_out = self.entering(t, ways, s.on_track(seen), speed, s, asking, reach, red)
         present = s.on_track(seen).present.copy()
         present[[i for i, _ in entries]] = True
         view = self._look(ways, seen._replace(present=present), speed, held, s, self._reach(speed) if entries else reach)
-        if not self.turns.any:
-            return s, Around(entries, stops, soon, held, kept_out, view)
         view = self.turns.ends(view, seen, overrun)
         s, turns = self._turn(t, ways, seen, reach, [] if last else np.flatnonzero(stood & ~np.isnan(s.turns_since)).tolist(), s)
         return s, Around(entries, stops, soon, held, kept_out, view, turns)
@@ -166,10 +168,8 @@ class Traffic:
         """Let trains turn that stand for it, where the way back is theirs."""
         if not asks:
             return s, ()
-
-        def ordered(there: Ways, rows: Ints) -> list[tuple[int, int, int]]:
-            return self._ordered(t, there, seen._replace(row=rows), s)
-
+        ordered = None if self.p.obeys else lambda there, rows: self._ordered(t, there, seen._replace(row=rows), s)
+        # Where signals decide, a train has its block, and its signal on the way back holds it.
         asked = self.turns.ask(asks, ways, s.on_track(seen), reach, s.leg, s.standing, s.requests, ordered)
         ids, edges, kept = self.p.scenario.ids, self.p.rails.edges, np.full(len(s.leg), -1)
         kept[list(asked.kept)] = list(asked.kept.values())
@@ -187,7 +187,7 @@ class Traffic:
 
     def arrivals(self, t: float, seen: Seen, s: State) -> State:
         """Trains that have left at the end of their ways."""
-        gone = s.came & ~seen.present & ~s.left
+        gone = s.came & ~seen.present & ~s.left & ~s.entering
         if not gone.any():
             return s
         for i in np.flatnonzero(gone).tolist():
@@ -195,23 +195,23 @@ class Traffic:
         return s._replace(left=s.left | gone)
 
     def departures(self, t: float, seen: Seen, speed: Floats, s: State) -> State:
-        """Trains that are there for the first time."""
-        there = s.entering & seen.present
-        if not there.any():
+        """Trains that are there for the first time, and those that signals kept out: they are to ask again."""
+        there = seen.present & (s.entering | (self.roster.driven & ~s.came))
+        if not (there | s.entering).any():
             return s
         for i in np.flatnonzero(there).tolist():
             planned = float(self.roster.depart[i])
             self.journal.event(
                 t, "depart", train=self.p.scenario.ids[i], planned_s=planned, delay_s=t - planned, speed_mps=float(speed[i])
             )  # fmt: skip
-        return s._replace(entering=s.entering & ~there)
+        return s._replace(came=(s.came | there) & ~(s.entering & ~there), entering=np.zeros_like(s.entering))
 
     def due(self, t: float, s: State) -> list[int]:
         """Trains that are to come at ``t``: of each edge the first that waits there."""
         if s.came.all():
             return []
         first: dict[int, int] = {}
-        for i in np.flatnonzero(~s.came & (self.roster.depart <= t + 1e-9) & ~self._given_up(t)).tolist():
+        for i in np.flatnonzero(~s.came & ~self.roster.driven & (self.roster.depart <= t + 1e-9) & ~self._given_up(t)).tolist():
             first.setdefault(int(self.roster.edge[i]), i)
         return sorted(first.values(), key=lambda i: (self.roster.depart[i], i))
 
@@ -226,14 +226,18 @@ class Traffic:
         return [self.p.scenario.ids[i] for i in late]
 
     def entering(
-        self, t: float, ways: Ways, here: Seen, speed: Floats, s: State, due: Sequence[int], reach: Floats | None = None
-    ) -> tuple[State, Held, tuple[tuple[int, float], ...], dict[int, int]]:
+        self, t: float, ways: Ways, here: Seen, speed: Floats, s: State, due: Sequence[int], reach: Floats | None = None,
+        red: Held | None = None,
+    ) -> tuple[State, Held, tuple[tuple[int, float], ...], dict[int, int]]:  # fmt: skip
         """Trains of those that are ``due`` whose place is clear, with the speed they come with [m/s]; who keeps out the others."""
         self._take_over(ways, s)
         asking = np.zeros(len(speed), bool)
         asking[due] = True
         stands = (s.kept_out >= 0) & (np.abs(speed[s.kept_out]) < STANDS_MPS)  # who stands may wait for it in turn
-        s, held = self._request(t, ways, here, self._reach(speed) if reach is None else reach, asking, asking & ~stands, s)
+        if red is not None:
+            s, held = s._replace(waits_for=red.by.copy()), red
+        else:
+            s, held = self._request(t, ways, here, self._reach(speed) if reach is None else reach, asking, asking & ~stands, s)
         s = s._replace(parked=s.parked.copy(), stands_until=s.stands_until.copy())
         present, came, entering = here.present.copy(), s.came.copy(), s.entering.copy()
         come: list[tuple[int, float]] = []
@@ -248,7 +252,7 @@ class Traffic:
                 if present[i]:  # and stands for one more step, the one in which it comes back
                     s.parked[i], s.stands_until[i] = False, t + self.step_s
                 continue
-            v = self._entering_speed(i, ways, here, speed, view, s)
+            v = self._entering_speed(i, ways, here, speed, view, held, s)
             present[i] = v is not None
             if v is None:
                 kept_out[i] = waiting.kept_out(view, i)
@@ -259,7 +263,7 @@ class Traffic:
         keeping[list(kept_out)] = list(kept_out.values())
         return s._replace(came=came, entering=entering, kept_out=keeping), held, tuple(come), kept_out
 
-    def _entering_speed(self, i: int, ways: Ways, here: Seen, speed: Floats, view: View, s: State) -> float | None:
+    def _entering_speed(self, i: int, ways: Ways, here: Seen, speed: Floats, view: View, held: Held, s: State) -> float | None:
         """Speed with which a train can enter safely; None if it has to wait. ``view`` is that with the train at its place."""
         rules, v, roster = self.rules, self.roster.speed[i], self.roster
         limit = float(roster.speed_factor[i] * self.limit[roster.edge[i]])
@@ -269,16 +273,17 @@ class Traffic:
         if roster.like[i] and np.isnan(v) and len(there):
             depth = here.position[there] - ways.begin[here.row[there]]
             wanted = min(wanted, float(speed[there].mean() if roster.like[i] == "avg" else speed[there[np.argmin(depth)]]))
-        if (stop := self.stop_of(i, s)) is not None:  # it must be able to stop there
+        rooms = [float(held.room[i])]  # up to where it must be able to stop
+        if (stop := self.stop_of(i, s)) is not None:
             place = stop.place - float(self.p.rails.start_m[roster.edge[i]]) - float(roster.lane_position[i])
-            room = np.array([place + self._further(stop, i) - wanted * self.step_s])
+            rooms.append(place + self._further(stop, i))
+        if np.isfinite(last := self.turns.last_place(i)):
+            rooms.append(last - float(self.p.rails.start_m[roster.edge[i]] + roster.lane_position[i]))
+        for room in rooms if self.p.obeys else rooms[1:]:
             planned = float(min(rules.service_mps2, self.assumed.braking[i]))
-            wanted = min(wanted, float(supervisor.greatest_speed(room, planned, self.step_s, self.theta)[0]))
-        if np.isfinite(last := self.turns.last_place(i)):  # and before it turns
-            room = np.array([last - float(self.p.rails.start_m[roster.edge[i]] + roster.lane_position[i]) - wanted * self.step_s])
-            planned = float(min(rules.service_mps2, self.assumed.braking[i]))
-            wanted = min(wanted, float(supervisor.greatest_speed(room, planned, self.step_s, self.theta)[0]))
-        ahead = authority.of(view.targets, view.targets.train == i)
+            left = np.array([min(room, FAR_M) - wanted * self.step_s])
+            wanted = min(wanted, float(supervisor.greatest_speed(left, planned, self.step_s, self.theta)[0]))
+        ahead = authority.of(view.targets, (view.targets.train == i) & (view.targets.kind != supervisor.SIGNAL))
         stands = np.where(np.arange(len(speed)) == i, 0.0, speed)
         _, safe = supervisor.too_late(rules, self.assumed, stands, ahead, self.step_s, self.theta)
         entry = float(min(wanted, *safe.tolist(), np.inf))
@@ -306,7 +311,7 @@ class Traffic:
 
     def _returning(self, t: float, s: State) -> list[int]:
         """Trains that are parked and may go on."""
-        back: list[int] = np.flatnonzero(s.parked & (s.stands_until <= t + 1e-9)).tolist()
+        back: list[int] = np.flatnonzero(s.parked & ~self.roster.driven & (s.stands_until <= t + 1e-9)).tolist()
         return back
 
     def _may_return(self, i: int, speed: Floats, view: View) -> bool:
@@ -359,8 +364,10 @@ class Traffic:
                 continue
             room = self._place(stop, s) - float(seen.position[i])
             if standing[i]:
-                if t < s.stands_until[i] - 1e-9 or s.parked[i]:
+                stays = t < s.stands_until[i] - 1e-9 or s.parked[i]
+                if speed[i] < STANDS_MPS if self.roster.driven[i] else stays:  # SUMO ends the stops of its own trains
                     continue
+                s.parked[i] = False
                 late = self._called(i, stop, float(s.stands_since[i]), t, int(seen.edge[i]), s)
                 self.journal.event(t, "stop_left", train=self.p.scenario.ids[i], stop=stop.name, **_late(late))
                 s.stands_since[i] = s.stands_until[i] = np.nan
@@ -477,7 +484,12 @@ class Traffic:
     def _look(self, ways: Ways, seen: Seen, speed: Floats, held: Held, s: State, reach: Floats) -> View:
         """What is ahead of every train."""
         horizon = max(float(np.max(reach, where=seen.present, initial=0.0)) + 1000.0, self.join_range_m)
+        if self.p.obeys:
+            order = aspects.order(ways, self.net.joins, seen.row, seen.position, seen.present, horizon, held.room)
+        else:
+            order = interlocking.order(s.requests)
+        # Trains that SUMO drives may stop as they like: whoever follows one keeps his whole braking distance.
         return authority.look(
-            ways, self.net, self.limit, self.roster.speed_factor, seen.row, seen.position, speed, self.length,
-            seen.present, horizon, held.room, interlocking.order(s.requests),
+            ways, self.net, self.limit, self.roster.speed_factor, seen.row, seen.position, np.where(self.roster.driven, 0.0, speed),
+            self.length, seen.present, horizon, held.room, order, supervisor.SIGNAL if self.p.obeys else supervisor.SWITCH,
         )  # fmt: skip

@@ -124,7 +124,7 @@ class Turns:
 
     def ask(
         self, trains: Sequence[int], ways: Ways, seen: Seen, reach: Floats, leg: Ints, standing: Bools,
-        requests: interlocking.State, ordered: Ordered,
+        requests: interlocking.State, ordered: Ordered | None,
     ) -> Asked:  # fmt: skip
         """Ask for the ways back, one train after the other: each as if it were to enter the net where it stands.
 
@@ -140,8 +140,8 @@ class Turns:
             Turns made, and who stands at a stop.
         requests : interlocking.State
             Of all trains.
-        ordered : callable
-            See ``Ordered``.
+        ordered : callable, optional
+            See ``Ordered``; None: signals decide, and nobody has to ask.
         """
         line, arrival = self.p.line, self.p.roster.arrival
         turns, kept, leg = [], dict[int, int](), leg.copy()
@@ -151,24 +151,32 @@ class Turns:
             there, row, place = turned(ways, i, int(seen.row[i]), front, length, onward.tolist(), line.start_m, line.length_m)
             rows, position, present = seen.row + there.first[:-1] - ways.first[:-1], seen.position.copy(), seen.present.copy()
             rows[i], position[i], present[i] = row, there.begin[row] + place, False
-            asks = np.arange(len(rows)) == i
-            then = leg + asks
-            back, along_it = self.back(then), zones.of(there, self.net, self.later)
-            # It is on the track that others wait for, so it comes before whoever waits.
-            begins = np.unique(along_it.begins[row : there.first[i + 1]])
-            first = [(i, int(there.edge[k]), False) for k in begins.tolist() if k >= 0]
-            granted, held, _ = interlocking.request(
-                along_it, {**requests, "stretches": [*first, *requests["stretches"]]}, rows, position, self.length, present, reach,
-                self.p.supervision.margin_m + DRIVER_MARGIN_M, asks, None, standing & ~asks, ordered(there, rows), asks, back,
-            )  # fmt: skip
-            if held.room[i] <= 0.0:
-                kept[i] = int(held.by[i])
-                continue
-            requests, ways, leg = granted, there, then
+            then = leg + (np.arange(len(rows)) == i)
+            if ordered is not None:
+                requests, by = self._requested(i, there, rows, position, present, reach, then, standing, requests, ordered)
+                if by is not None:
+                    kept[i] = by
+                    continue
+            ways, leg = there, then
             seen = Seen(position, there.edge[rows], rows, seen.present)
             leaves = float(arrival[i]) if leg[i] == self.last_leg[i] else np.inf
             turns.append(Turn(i, tuple(line.edges[e] for e in onward.tolist()), leaves))
         return Asked(requests, tuple(turns), kept)
+
+    def _requested(
+        self, i: int, there: Ways, row: Ints, position: Floats, present: Bools, reach: Floats, leg: Ints, standing: Bools,
+        requests: interlocking.State, ordered: Ordered,
+    ) -> tuple[interlocking.State, int | None]:  # fmt: skip
+        """Requests with the way back of ``i`` granted, and None; or as they were, and because of whom it is not."""
+        asks, along_it = np.arange(len(row)) == i, zones.of(there, self.net, self.later)
+        # It is on the track that others wait for, so it comes before whoever waits.
+        begins = np.unique(along_it.begins[row[i] : there.first[i + 1]])
+        first = [(i, int(there.edge[k]), False) for k in begins.tolist() if k >= 0]
+        granted, held, _ = interlocking.request(
+            along_it, {**requests, "stretches": [*first, *requests["stretches"]]}, row, position, self.length, present, reach,
+            self.p.supervision.margin_m + DRIVER_MARGIN_M, asks, None, standing & ~asks, ordered(there, row), asks, self.back(leg),
+        )  # fmt: skip
+        return (requests, int(held.by[i])) if held.room[i] <= 0.0 else (granted, None)
 
 
 def stopping(p: Model) -> Callable[[Ints, Floats], Floats]:

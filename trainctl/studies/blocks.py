@@ -19,6 +19,9 @@ SMALLEST = 10
 #: Trains of one block: enough to share the fixed cost of a step, few enough for the second cache.
 TRAINS = 6000
 
+#: Trains of one block where they have units: ten runs are as fast as any number, and results come by the block.
+TRAINS_OF_UNITS = 120
+
 #: Positions a block remembers, trains times recorded instants.
 REMEMBERED = 8_000_000
 
@@ -57,7 +60,8 @@ def blocks(batch: Batch, model: Model, workers: int) -> list[Batch]:
     """A batch in blocks, for so many workers; ``model`` is one of its runs."""
     run, n, runs = model.scenario.run, len(model.scenario.ids), len(batch.seeds)
     rows = run.steps // run.recorded_steps + 2
-    most = max(1, min(TRAINS // n, REMEMBERED // (n * rows)))
+    trains = TRAINS_OF_UNITS if model.has_units else TRAINS
+    most = max(1, min(trains // n, REMEMBERED // (n * rows)))
     size = max(1, min(most, math.ceil(runs / (PER_WORKER * workers))))
     return [batch.of(piece.tolist()) for piece in np.array_split(np.arange(runs), math.ceil(runs / size))]
 
@@ -93,12 +97,12 @@ def simulate_block(block: Batch) -> Part:
 def _stacked(jobs: Sequence[Job], models: Sequence[Model]) -> tuple[Part, list[str | None]]:
     """Results of runs side by side, and why some must be done by themselves after all."""
     from trainctl.ensemble.stack import stacked
-    from trainctl.ensemble.steps import points
+    from trainctl.ensemble.steps import simulated
 
     runs = len(models)
     try:
         with np.errstate(all="ignore"):  # of a run that diverges; it is done again by itself, and tells
-            done = points(stacked(models))
+            done = simulated(stacked(models))
     except Exception as error:  # a law that takes one run alone; its own run tells what is wrong with it
         return part([]), [f"{type(error).__name__}: {error}"] * runs
     counts = {key: np.zeros(runs) for key in COUNTS}

@@ -15,7 +15,7 @@ from trainctl.errors import InputError
 from trainctl.figures import style
 from trainctl.figures.overlay import QUANTITIES, overlay
 from trainctl.figures.trains import drawable
-from trainctl.laws import compared, find_plant, plants_of
+from trainctl.laws import compared, find_law, find_plant, plants_of
 from trainctl.metrics.run import DEFINITIONS, metrics
 from trainctl.metrics.values import Values
 from trainctl.runs.run import Run
@@ -72,29 +72,29 @@ def figures(runs: Sequence[Run], labels: Sequence[str], out: Path, formats: Sequ
 
 def latex(rows: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> str:
     """The table as a ``tabular`` of booktabs, three significant digits, a dash where a metric does not apply."""
-    lines = [" & ".join(["metric", "unit", *map(_escaped, labels)]), *(
-        " & ".join([_escaped(row["metric"]), _unit(row["unit"]), *map(_number, row["values"])]) for row in rows
+    lines = [" & ".join(["metric", "unit", *map(escaped, labels)]), *(
+        " & ".join([escaped(row["metric"]), _unit(row["unit"]), *map(_number, row["values"])]) for row in rows
     )]  # fmt: skip
     body = " \\\\\n".join([f"{lines[0]} \\\\\n\\midrule\n{lines[1]}" if len(lines) > 1 else lines[0], *lines[2:]])
     columns = "ll" + "r" * len(labels)
     return f"% \\usepackage{{booktabs}}\n\\begin{{tabular}}{{{columns}}}\n\\toprule\n{body} \\\\\n\\bottomrule\n\\end{{tabular}}\n"
 
 
-def _escaped(text: str) -> str:
+def escaped(text: str) -> str:
     """Text whose signs mean nothing to TeX."""
     signs = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
     return "".join(signs.get(sign, f"\\{sign}" if sign in "&%$#_{}" else sign) for sign in text)
 
 
 def _unit(text: str) -> str:
-    return re.sub(r"(?<=[a-z])(\d)", r"$^\1$", _escaped(text)) if text != "1" else ""
+    return re.sub(r"(?<=[a-z])(\d)", r"$^\1$", escaped(text)) if text != "1" else ""
 
 
 def _number(value: Any) -> str:
     if value is None:
         return "--"
     if isinstance(value, bool | str) or not isinstance(value, int | float):
-        return _escaped(str(value))
+        return escaped(str(value))
     value = float(f"{value:.2e}")
     if value == 0.0 or 1e-3 <= abs(value) < 1e6:
         return f"${value:,g}$".replace(",", r"\,")
@@ -106,7 +106,7 @@ def _number(value: Any) -> str:
 
 
 def alternatives(data: Mapping[str, Any], known: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """The scenario under every law that there is.
+    """The scenario under every law that comes with trainctl.
 
     Parameters
     ----------
@@ -119,13 +119,60 @@ def alternatives(data: Mapping[str, Any], known: Sequence[str]) -> dict[str, dic
     -------
     dict
         Name of the row -> tables of its scenario. Keys of the laws' own that have a counterpart in the scenario's bounds are
-        derived from it; all others are the law's defaults (the paper's).
+        derived from it; all others are the law's defaults (the paper's), or what ``[alternative.ROW]`` of the scenario says.
     """
     name = str(data["controller"]["law"])
     return {
-        row: dict(data) if name == _name(law) and row == _row(law, data["controller"]) else _under(row, law, data)
+        row: dict(data) if name == _name(law) and row == _row(law, data["controller"]) else _under(row, _name(law), law, data)
         for row, law in compared().items() if _name(law) in known
     }  # fmt: skip
+
+
+def others(
+    data: Mapping[str, Any], known: Sequence[str], folder: Path, files: Sequence[str] = ()
+) -> tuple[dict[str, dict[str, Any]], dict[str, list[str]]]:
+    """The scenario under laws that do not come with trainctl: its own, those of other packages, and files.
+
+    Parameters
+    ----------
+    data, known
+        As in ``alternatives``.
+    folder : Path
+        Where the path of the scenario's law starts.
+    files : sequence of str
+        Paths of further laws, from the current directory.
+
+    Returns
+    -------
+    dict
+        Name of the row -> tables of its scenario.
+    dict
+        Rows that are left out -> why.
+    """
+    own = str(data["controller"]["law"])
+    ours = {_name(law) for law in compared().values()}
+    places = {own: folder, **{str(Path(file).resolve()): Path() for file in files}, **dict.fromkeys(known, Path())}
+    found: dict[str, dict[str, Any]] = {}
+    left_out: dict[str, list[str]] = {}
+    for name, where in places.items():
+        if name in ours:
+            continue
+        label = Path(name).stem if name.endswith(".py") else name
+        try:
+            law = find_law(name, where)
+        except InputError as error:
+            left_out[label] = list(error.mistakes)
+            continue
+        for row in getattr(law, "COMPARED", {label: {}}):
+            its = row if row not in found else f"{row}_{len(found) + 1}"
+            found[its] = dict(data) if name == own else _under(row, name, law, data)
+    return found, left_out
+
+
+def strange(data: Mapping[str, Any], rows: Sequence[str]) -> list[str]:
+    """Rows that ``[alternative]`` names and nobody runs."""
+    known = ", ".join(rows)
+    return [f"alternative.{row}: no such row; there are: {known}" for row in data.get("alternative", {}) if row not in rows]
 
 
 def _name(law: Any) -> str:
@@ -140,13 +187,13 @@ def _row(law: Any, controller: Mapping[str, Any]) -> str:
     return (fitting or list(rows))[-1 if fitting else 0]
 
 
-def _under(row: str, law: Any, data: Mapping[str, Any]) -> dict[str, Any]:
+def _under(row: str, name: str, law: Any, data: Mapping[str, Any]) -> dict[str, Any]:
     """The scenario under another law, on a plant the law runs on where there is one of the same sort."""
     changed: dict[str, Any] = {key: value for key, value in data.items() if key not in ("controller", "observer")}
     changed["title"] = f"{row.replace('_', ' ')} on the traffic of: {data.get('title', '')}"
     changed["run"] = {"step_s": 1.0, **{key: value for key, value in data["run"].items() if key != "control_period_s"}}
     changed["topology"] = dict(data.get("topology", {}))
-    changed["controller"] = {"law": _name(law), **law.COMPARED[row]}
+    changed["controller"] = {"law": name, **getattr(law, "COMPARED", {}).get(row, {})}
     plant = {"kind": "point", **data.get("plant", {})}
     module, usual = find_plant(str(plant["kind"])), plants_of(law)
     if plant["kind"] not in usual:
@@ -155,4 +202,5 @@ def _under(row: str, law: Any, data: Mapping[str, Any]) -> dict[str, Any]:
         clamps = find_plant(str(plant["kind"])).CLAMPS
         plant |= {key: value for key, value in data.get("bounds", {}).items() if key in clamps}
     changed["plant"] = plant
-    return {**changed, **(law.alternative(changed) if hasattr(law, "alternative") else {})}
+    changed |= law.alternative(changed) if hasattr(law, "alternative") else {}
+    return {**changed, "controller": {**changed["controller"], **data.get("alternative", {}).get(row, {})}}

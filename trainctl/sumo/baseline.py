@@ -6,18 +6,19 @@ Nothing is commanded but reroutes, so the trains move as in SUMO run without us.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import libsumo
 import numpy as np
 
 from sumo_net.netfile import RAIL
 from trainctl.errors import CouplingError, InputError, SimulatorError
-from trainctl.railway.ways import rerouted, ways
+from trainctl.railway.ways import ways
 from trainctl.scenario.model import Model
 from trainctl.signals import Bools, Floats, Ints, Observed, Seen
 from trainctl.sumo.baseline_files import departures, verify_signals, write_configuration, write_own_configuration, write_routes
-from trainctl.sumo.session import LOGS, TOLERANCE_M, Session
+from trainctl.sumo.commanded_files import LOGS
+from trainctl.sumo.session import TOLERANCE_M, Session
+from trainctl.sumo.signal_box import row_of
 
 #: How far ahead SUMO is asked for the next train on a net [m].
 LOOK_M = 20_000.0
@@ -59,7 +60,6 @@ class Baseline(Session):
             np.array([d.position_m for d in self.departures]) if p.placed else p.roster.lane_position
         )
         self.stops = ("",) * len(self.ids)
-        self.since = 0.0  # s, when SUMO begins
         self.others: dict[str, str] = {}  # vClass of who runs beside the trains that are known
         self.seen = Seen(position, self.ways.edge[row], row, there)  # where they will come
 
@@ -84,7 +84,7 @@ class Baseline(Session):
                 self._begin(write_own_configuration(self.p, self.net.name, self.folder))
             except SimulatorError as error:
                 raise InputError(f"{self.p.file}: network.sumocfg: {error}") from None
-            self.since = self._time()
+            self.since = self.now()
         self._read()
         self._verify_placed()
 
@@ -99,19 +99,15 @@ class Baseline(Session):
 
     def messages(self) -> list[tuple[float | None, str]]:
         """As of ``World``."""
-        found = [(None if at is None else at - self.since, text) for at, text in super().messages()]
+        found = super().messages()
         if trains := [name for name, vclass in self.others.items() if vclass in RAIL]:
             some = f"{', '.join(trains[:8])}{' ...' if len(trains) > 8 else ''}"
             found.append((None, f"{len(trains)} trains that SUMO draws otherwise than duarouter are not recorded: {some}"))
         return found
 
-    def collisions(self) -> list[dict[str, Any]]:
-        """As of ``World``."""
-        return [found | {"time_s": found["time_s"] - self.since} for found in super().collisions()]
-
     def _read(self) -> None:
         """Where SUMO has the trains."""
-        n, vehicle = len(self.ids), libsumo.vehicle
+        n, vehicle, rails = len(self.ids), libsumo.vehicle, None if self.p.placed else self.p.rails
         everybody = vehicle.getIDList()
         there = [name for name in everybody if name in self.number]
         self.others |= {
@@ -122,7 +118,7 @@ class Baseline(Session):
         stops = [""] * n
         for name in there:
             i = self.number[name]
-            row[i], present[i] = self._row(i, vehicle.getRoadID(name)), True
+            row[i], present[i] = row_of(self, rails, i, vehicle.getRoadID(name)), True
             position[i] = self.ways.begin[row[i]] + vehicle.getLanePosition(name)
             self.speed[i] = vehicle.getSpeed(name)
             stops[i] = _stop(name) if vehicle.isStopped(name) else ""
@@ -135,32 +131,6 @@ class Baseline(Session):
         else:
             for name in there:
                 self._ahead_on_way(name)
-
-    def _row(self, i: int, edge: str) -> int:
-        """The row of the edge a train is on, from where it was on its way; SUMO may have given it another."""
-        for _ in range(2):
-            row, end = int(self.seen.row[i]), int(self.ways.first[i + 1])
-            onward = np.flatnonzero(self.ways.edge[row:end] == self.line.index.get(edge, -1))
-            if len(onward):
-                return row + int(onward[0])
-            self._take_over(i, edge)
-        raise CouplingError(f"train {self.ids[i]} left its way on edge {edge} at {self._time():.3f} s")
-
-    def _take_over(self, i: int, edge: str) -> None:
-        """The way of a train that SUMO's own rerouters, or its routing, have changed, from the edge it was on."""
-        if self.p.placed:
-            return
-        name, line, row = self.ids[i], self.line, int(self.seen.row[i])
-        route, at = libsumo.vehicle.getRoute(name), libsumo.vehicle.getRouteIndex(name)
-        was = line.edges[self.ways.edge[row]]
-        first = max(k for k in range(at + 1) if k == 0 or route[k] == was)
-        try:
-            way = self.p.rails.way(route[first:])
-        except ValueError as error:
-            raise CouplingError(f"train {name} on edge {edge} at {self._time():.3f} s: {error}") from None
-        before = self.ways.first
-        self.ways = rerouted(self.ways, i, row, way, line.start_m, line.length_m)
-        self.seen = self.seen._replace(row=self.seen.row + self.ways.first[:-1] - before[:-1])
 
     def _ahead_on_track(self) -> None:
         """Find the train ahead on the same track of a line."""

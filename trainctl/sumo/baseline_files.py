@@ -15,7 +15,7 @@ from sumo_net.netfile import content
 from trainctl.errors import InputError
 from trainctl.scenario.model import Model
 from trainctl.signals import SPEED, Floats
-from trainctl.sumo.session import OPTIONS, fcd_period, normal
+from trainctl.sumo.commanded_files import OPTIONS, fcd_period, normal
 from trainctl.traffic.files import named_files, read_options
 
 #: Options that are ours: what is written and shown, and who listens.

@@ -1,8 +1,4 @@
-"""SUMO behind the loop: start, measure, command and step through libsumo. Nothing else in the package imports libsumo.
-
-The options below are not taste: each one switches off something of SUMO's that silently moves, holds back or removes a train
-(measured on SUMO 1.28).
-"""
+"""SUMO behind the loop: start, measure, command and step through libsumo. Nothing else in the package imports libsumo."""
 
 from __future__ import annotations
 
@@ -11,10 +7,9 @@ import os
 import re
 import sys
 from collections import deque
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
 import libsumo
 import numpy as np
@@ -27,8 +22,10 @@ from trainctl.railway.ways import Ways, rerouted, turned
 from trainctl.runs.sumo_logs import elements
 from trainctl.signals import Bools, Floats, Ints, Links, Seen, Start
 from trainctl.sumo.causes import SPEED_MODE_FREE, cause
+from trainctl.sumo.commanded_files import LOGS, arrival_word, normal, write_configuration, write_routes
 from trainctl.sumo.idling import OF_IDLING, idle_s, silent
 from trainctl.sumo.preflight import objections
+from trainctl.sumo.signal_box import Box, Obeyed
 
 #: What SUMO adds in one step is exact to rounding; anything beyond was somebody else.
 TOLERANCE_M = 1e-6
@@ -45,98 +42,6 @@ PARKS_S, PARKING = 1e6, 1
 #: SUMO puts a train that turns so far beyond its place [m], and by the junctions under it; told to go as far before it turns, it
 #: stands where it should.
 TURNS_M = 1e-3
-
-OPTIONS = {
-    "time-to-teleport": "-1",  # a train held at speed 0 would teleport after 300 s
-    "collision.action": "warn",  # the default removes the train; gaps are the monitors' business
-    "collision.mingap-factor": "0",  # a gap below minGap is not yet a collision
-    "insertion-checks": "none",  # one train per block at insertion, even without signals: the second never appears
-    "default.speeddev": "0",
-    "step-method.ballistic": "false",  # said aloud: an action step length would switch it on
-    "no-step-log": "true",
-    "fcd-output.distance": "true",
-    "tripinfo-output.write-unfinished": "true",
-    "vehroute-output.write-unfinished": "true",
-    "precision": "9",
-    "no-warnings": "false",
-}
-
-#: SUMO's own logs. Given on the command line only: who opens run.sumocfg in sumo-gui must not overwrite them.
-LOGS = {
-    "fcd-output": "fcd.parquet",
-    "tripinfo-output": "tripinfo.xml",
-    "summary-output": "summary.xml",
-    "statistic-output": "statistics.xml",
-    "collision-output": "collisions.xml",
-    "vehroute-output": "vehroute.xml",
-    "log": "messages.log",
-}
-
-
-def write_routes(start: Start, path: Path) -> list[str]:
-    """The trains as SUMO vehicles: true lengths and carriages, no randomness, no limits of SUMO's own.
-
-    Those that come later have their types here and are added when they come. Returns the type of every train.
-    """
-    types: dict[tuple[str, tuple[float, ...]], str] = {}
-    rows, kinds = [], []
-    for i, name in enumerate(start.ids):
-        units = tuple(float(x) for x in start.unit_length[i])
-        kinds.append(types.setdefault((start.vclass[i], units), f"train{len(types) + 1}"))
-        if not start.present[i]:
-            continue
-        route = " ".join(normal(start.routes[i]))
-        arrival = arrival_word(np.inf if start.arrival is None else float(start.arrival[i]))
-        rows.append(
-            f'    <vehicle id={quoteattr(name)} type="{kinds[-1]}" depart="0" departLane="best" insertionChecks="none"'
-            f' departPos="{float(start.lane_position[i])!r}" departSpeed="{float(start.speed[i])!r}" arrivalPos="{arrival}">\n'
-            f'        <route edges="{route}"/>\n    </vehicle>\n'
-        )
-    with path.open("w", encoding="utf-8") as out:
-        out.write("<routes>\n")
-        for (vclass, units), kind in types.items():
-            length = max(math.fsum(units), 1.0)  # SUMO has no points
-            out.write(
-                f'    <vType id="{kind}" vClass="{vclass}" guiShape="rail" length="{length!r}"'
-                f' carriageLength="{max(max(units), 1.0)!r}" carriageGap="0" minGap="0" sigma="0"'
-                ' speedFactor="1" speedDev="0" maxSpeed="500" accel="100" decel="100"'
-                ' emergencyDecel="1000"/>\n'
-            )
-        out.writelines(rows)
-        out.write("</routes>\n")
-    return kinds
-
-
-def arrival_word(place: float) -> str:
-    """Where a train leaves, as SUMO takes it: at this place of its last edge [m], or at the end."""
-    return "max" if math.isinf(place) else repr(place)
-
-
-def normal(route: Iterable[str]) -> list[str]:
-    """A route as SUMO takes it: without internal edges."""
-    return [edge for edge in route if not edge.startswith(":")]
-
-
-def write_configuration(
-    folder: Path, net: str, routes: str, step: float, end: float, internal: bool = False, record_every: float | None = None
-) -> Path:
-    """``run.sumocfg``: SUMO's own sumo and sumo-gui open it.
-
-    ``internal`` says whether the net has edges inside junctions, ``record_every`` [s] how often the FCD log is written: it takes a
-    third of SUMO's time.
-    """
-    options = {"net-file": net, "route-files": routes, "begin": "0", "end": f"{end:.3f}", "step-length": f"{step:g}", **OPTIONS}
-    options |= fcd_period(record_every)
-    options |= {"collision.check-junctions": "true"} if internal else {"no-internal-links": "true"}
-    path = folder / "run.sumocfg"
-    body = "".join(f"    <{key} value={quoteattr(value)}/>\n" for key, value in options.items())
-    path.write_text(f"<configuration>\n{body}</configuration>\n", encoding="utf-8")
-    return path
-
-
-def fcd_period(every: float | None) -> dict[str, str]:
-    """Options for an FCD log with rows every so often [s]; every step if None."""
-    return {} if every is None else {"device.fcd.period": f"{every:.3f}"}
 
 
 def messages(log: Path) -> list[tuple[float | None, str]]:
@@ -174,6 +79,7 @@ class Session:
     ids: Sequence[str]
     ways: Ways
     seen: Seen
+    since = 0.0  # s, when SUMO begins by its own clock
 
     def __init__(self, line: Line, net: Path, folder: Path, step: float, steps: int, record_every: float | None = None) -> None:
         self.line, self.net, self.folder, self.time_step, self.steps = line, net, folder, step, steps
@@ -215,28 +121,39 @@ class Session:
     def messages(self) -> list[tuple[float | None, str]]:
         """Warnings and errors SUMO wrote, with the time it named, if any."""
         found = messages(self.folder / LOGS["log"])
-        return [(at, text) for at, text in found if not text.startswith(OF_IDLING)]
+        return [(None if at is None else at - self.since, text) for at, text in found if not text.startswith(OF_IDLING)]
 
     def collisions(self) -> list[dict[str, Any]]:
         """Collisions SUMO counted, see ``World``."""
-        return collisions(self.folder / LOGS["collision-output"], self.ids)
+        found = collisions(self.folder / LOGS["collision-output"], self.ids)
+        return [one | {"time_s": one["time_s"] - self.since} for one in found]
 
-    def _time(self) -> float:
-        return float(self.api.simulation.getTime()) - self.time_step
+    def now(self) -> float:
+        """Scenario time [s]."""
+        return float(self.api.simulation.getTime()) - self.time_step - self.since
 
     def _call(self, function: Any, *arguments: Any, **more: Any) -> Any:
         """Libsumo's own errors in the project's words."""
         try:
             return function(*arguments, **more)
         except (self.api.TraCIException, self.api.FatalTraCIError) as error:
-            where = f" at {self._time():.3f} s" if self.began and libsumo.simulation.isLoaded() else ""
+            where = f" at {self.now():.3f} s" if self.began and libsumo.simulation.isLoaded() else ""
             raise SimulatorError(f"SUMO{where}: {error}") from None
 
 
 class Sumo(Session):
     """SUMO behind the loop: trains move by what they are told."""
 
-    idle = True  # see ``idling``
+    idle = True  # see ``idling``; not where signals are obeyed
+    box: Box | None = None
+
+    def __init__(
+        self, line: Line, net: Path, folder: Path, step: float, steps: int, record_every: float | None = None,
+        obeyed: Obeyed | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__(line, net, folder, step, steps, record_every)
+        self.obeyed = obeyed
+        self.since = 0.0 if obeyed is None else obeyed.handed.begin_s
 
     def start(self, start: Start) -> None:
         """Load the net, insert the trains, verify each of them, and take every speed correction off."""
@@ -244,10 +161,10 @@ class Sumo(Session):
         wrong = objections(self.line, self.time_step)
         if wrong:
             raise SimulatorError("; ".join(wrong))
-        self.kinds = write_routes(start, self.folder / "trains.rou.xml")
+        self.kinds = write_routes(start, self.folder / "trains.rou.xml", self.obeyed)
         end = (self.steps + 1) * self.time_step
         configuration = write_configuration(
-            self.folder, self.net.name, "trains.rou.xml", self.time_step, end, self.internal, self.record_every
+            self.folder, self.net.name, "trains.rou.xml", self.time_step, end, self.internal, self.record_every, self.obeyed
         )
         vehicle = self.api.vehicle
         self._lane_position, self._set_speed = _direct(vehicle.getLanePosition), _direct(vehicle.setSpeed)
@@ -260,28 +177,41 @@ class Sumo(Session):
         self.taken_off: set[int] = set()
         self.way_end = self._way_end()
         self.coming: list[tuple[int, float]] = []
+        self.pending: dict[int, float] = {}
         self.returning: list[int] = []
         self._begin(configuration)
-        everyone = np.flatnonzero(start.present)
-        self._verify_insertion(everyone, start.speed[everyone])
         row = self.ways.first[:-1].copy()
-        self.seen = Seen(self.ways.begin[row] + start.lane_position, self.ways.edge[row], row, start.present.copy())
+        everyone = np.flatnonzero(start.present)
+        self.coming = list(zip(everyone.tolist(), start.speed[everyone].tolist(), strict=True))
+        everyone = self._verify_insertion()
+        present = np.isin(np.arange(len(self.ids)), everyone)
+        self.seen = Seen(self.ways.begin[row] + start.lane_position, self.ways.edge[row], row, present)
         self.seen.position[everyone] = self.ways.begin[row[everyone]] + self._lane_positions(everyone)
+        if self.obeyed is not None:
+            self.idle, self.box = False, Box(self, self.obeyed)
+            self.seen = self.box.read().within(self.seen, self.ways)
         if self.idle:
             with silent():
                 for kind in sorted(set(self.kinds)):
                     self._call(self.api.vehicletype.setActionStepLength, kind, idle_s(self.time_step))
 
-    def _verify_insertion(self, trains: Ints, speeds: Floats) -> None:
-        """Whether these trains are where they were put; takes every speed correction off them."""
+    def _verify_insertion(self) -> Ints:
+        """Whether the trains that come are where they were put; takes every speed correction off them. Which have come.
+
+        Where signals are obeyed SUMO may keep them out.
+        """
         vehicle = self.api.vehicle
         present = set(vehicle.getIDList())
-        wrong = []
-        for i, wanted_speed in zip(trains.tolist(), speeds.tolist(), strict=True):
+        wrong, come = [], []
+        coming, self.coming = self.coming, []
+        for i, wanted_speed in coming:
             name, edge = self.ids[i], self.line.edges[self.ways.edge[self.ways.first[i]]]
             if name not in present:
-                wrong.append(f"train {name} was not inserted on edge {edge}")
+                self.pending[i] = wanted_speed
+                wrong += [] if self.obeyed is not None else [f"train {name} was not inserted on edge {edge}"]
                 continue
+            self.pending.pop(i, None)
+            come.append(i)
             on, where, speed = vehicle.getRoadID(name), vehicle.getLanePosition(name), vehicle.getSpeed(name)
             if on != edge or abs(where - self.departs_m[i]) > TOLERANCE_M:
                 wanted = f"{edge} at {self.departs_m[i]:.6f} m"
@@ -292,6 +222,7 @@ class Sumo(Session):
             vehicle.setLaneChangeMode(name, 0)
         if wrong:
             raise CouplingError("; ".join(wrong))
+        return np.array(come, np.int64)
 
     def measure(self) -> Seen:
         """Front positions on the line and edges."""
@@ -314,7 +245,7 @@ class Sumo(Session):
             except (self.api.TraCIException, KeyError, IndexError) as error:
                 why = "it left its way" if isinstance(error, IndexError) else str(error)
                 raise CouplingError(
-                    f"train {self.ids[i]} is not on its way at {self._time():.3f} s: {why} (likely cause: {self._cause(i)})"
+                    f"train {self.ids[i]} is not on its way at {self.now():.3f} s: {why} (likely cause: {self._cause(i)})"
                 ) from None
         return found
 
@@ -346,15 +277,22 @@ class Sumo(Session):
         self.way_end = self._way_end()
 
     def insert(self, train: int, speed: float) -> None:
-        """Put a train on the net where it was to start; it is there after the next ``move``."""
+        """Put a train on the net where it was to start; it is there after the next ``move``, or signals keep it out."""
         name = self.ids[train]
-        self._call(self.api.route.add, f"way_{name}", normal(self.routes[train]))
+        self.coming.append((train, speed))
+        if self.pending.get(train) == speed:  # SUMO tries again by itself
+            return
+        if train in self.pending:
+            self._call(self.api.vehicle.remove, name)
+        if f"way_{name}" not in self.api.route.getIDList():
+            self._call(self.api.route.add, f"way_{name}", normal(self.routes[train]))
         self._call(
             self.api.vehicle.add, name, f"way_{name}", typeID=self.kinds[train], depart="now", departLane="best",
             departPos=repr(float(self.departs_m[train])), departSpeed=repr(speed),
             arrivalPos=arrival_word(float(self.arrival[train])),
         )  # fmt: skip
-        self.coming.append((train, speed))
+        if self.obeyed is not None:
+            self._call(self.api.vehicle.setParameter, name, "tripId", self.obeyed.handed.trips[train])
 
     def park(self, train: int, off: bool) -> None:
         """Let a train that stands leave its lane, by a stop without an end, or come back to it."""
@@ -363,11 +301,25 @@ class Sumo(Session):
             self._call(vehicle.resume, name)
             self.returning.append(train)
             return
+        if self.idle:  # a driver that never decides does not see his stop
+            self._call(vehicle.setActionStepLength, name, self.time_step)
+        self._stop_here(name, PARKING)
+
+    def halt(self, train: int, stands: bool) -> None:
+        """Let SUMO know where signals are obeyed that a train stands at a stop: it asks for no signal meanwhile."""
+        if self.obeyed is None:
+            return
+        if stands:
+            self._stop_here(self.ids[train], 0)
+        else:
+            self._call(self.api.vehicle.resume, self.ids[train])
+
+    def _stop_here(self, name: str, flags: int) -> None:
+        """A stop without an end where a train stands."""
+        vehicle = self.api.vehicle
         edge, place = vehicle.getRoadID(name), vehicle.getLanePosition(name)
-        # A driver that never decides does not see his stop.
-        self._call(vehicle.setActionStepLength, name, self.time_step)
         self._call(
-            vehicle.setStop, name, edge, pos=place, laneIndex=vehicle.getLaneIndex(name), duration=PARKS_S, flags=PARKING,
+            vehicle.setStop, name, edge, pos=place, laneIndex=vehicle.getLaneIndex(name), duration=PARKS_S, flags=flags,
             startPos=max(place - 1.0, 0.0),
         )  # fmt: skip
 
@@ -387,14 +339,21 @@ class Sumo(Session):
         speeds = displacement / step
         for train, edges, _ in self.turning:
             speeds[train] = (TURNS_M + self._inside(train, edges)) / step
-        self._call(self._command, np.flatnonzero(present), speeds)
+        ours = present if self.box is None else present & ~self.box.obeyed.driven
+        self._call(self._command, np.flatnonzero(ours), speeds)
         if self.idle:
             for i in np.flatnonzero(present & (left < PLANNED_M)).tolist():
                 self._call(self._plan, self.ids[i], 0.0)
+        for i in self.pending.keys() - {i for i, _ in self.coming}:  # these are not to come now
+            self._call(self.api.vehicle.remove, self.ids[i])
+            del self.pending[i]
         self._call(self.api.simulationStep)
         for train, edges, arrival in self.turning:
             wanted[train], left[train] = self._turned(train, edges, arrival)
         self.turning.clear()
+        own = None
+        if self.box is not None:
+            own, present = self.box.read(), present & ~self.box.obeyed.driven
         present = present & ~self._left(wanted, present)
         now = self._read(wanted, left, present)
         wrong = np.flatnonzero(np.abs(now.position - wanted) > TOLERANCE_M)
@@ -402,14 +361,11 @@ class Sumo(Session):
             raise CouplingError("; ".join(self._explain(int(i), now, before, displacement) for i in wrong[:5]))
         for i in self.returning:
             if not self.api.vehicle.getLaneID(self.ids[i]):
-                raise CouplingError(f"train {self.ids[i]} is parked; SUMO does not let it back at {self._time():.3f} s")
+                raise CouplingError(f"train {self.ids[i]} is parked; SUMO does not let it back at {self.now():.3f} s")
         self.returning.clear()
         if self.coming:
-            trains = np.array([i for i, _ in self.coming])
-            self._verify_insertion(trains, np.array([speed for _, speed in self.coming]))
-            now.present[trains] = True
-            self.coming.clear()
-        self.seen = now
+            now.present[self._verify_insertion()] = True
+        self.seen = now if own is None else own.within(now, self.ways)
 
     def _inside(self, train: int, edges: tuple[str, ...]) -> float:
         """Length of the junctions under a train once it has turned [m]."""
@@ -457,7 +413,7 @@ class Sumo(Session):
         name, edge = self.ids[i], self.line.edges[now.edge[i]]
         moved = now.position[i] - before[i]
         return (
-            f"train {name} on {edge} at {self._time():.3f} s moved {moved:.6f} m, commanded {displacement[i]:.6f} m:"
+            f"train {name} on {edge} at {self.now():.3f} s moved {moved:.6f} m, commanded {displacement[i]:.6f} m:"
             f" something else moved it (likely cause: {self._cause(i)})"
         )
 

@@ -93,6 +93,15 @@ def pairs(plan: Plan, order: Ints, track: Ints) -> Ints:
     return np.hstack([near, np.array(more, np.int64).reshape(-1, 2).T])
 
 
+def closed_up(plan: Plan, order: Ints, track: Ints) -> Floats:
+    """Wanted position of every train relative to the reference [m], (n,), where the trains of each track keep equal spacings."""
+    begins = np.flatnonzero(np.concatenate([[True], track[order[1:]] != track[order[:-1]]]))
+    place = np.arange(len(order)) - np.repeat(begins, np.diff(np.append(begins, len(order))))
+    slots = np.empty(len(order))
+    slots[order] = plan.first_slot - (plan.desired[0] if len(plan.desired) else 0.0) * place
+    return slots
+
+
 def links(plan: Plan, order: Ints, track: Ints) -> Links:
     """The directed edge list for trains on ``track`` (n,) in ``order`` (n,), from ``order_on_tracks``."""
     n = len(track)
@@ -120,7 +129,7 @@ def links(plan: Plan, order: Ints, track: Ints) -> Links:
         upper=table[2].copy(),
         weight=table[3].copy(),
         heard=np.ones(len(sender), bool),
-        slot=plan.slot,
+        slot=closed_up(plan, order, track) if plan.equal else plan.slot,
         order=np.asarray(order, np.int64).copy(),
     )
 

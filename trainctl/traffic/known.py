@@ -33,6 +33,7 @@ OFF = frozenset(("", "0", "false", "False", "off", "no", "-1", "none", "0.0", "0
 OPTIONS = _words(
     "net-file route-files additional-files begin end scale scale-suffix max-depart-delay use-stop-ended",
     "default.departspeed",
+    "railsignal-moving-block",  # where signals are obeyed, see of_signals
 )
 
 #: Options that cannot change the run of a train: what is written, drawn and checked, and how fast SUMO itself runs.
@@ -69,7 +70,6 @@ OPTIONS_NAMED: Mapping[str, tuple[str, frozenset[str]]] = {
     "default.carfollowmodel": ("the scenario's law drives the trains", frozenset()),
     "default.emergencydecel": ("the scenario's supervisor brakes the trains", frozenset()),
     "use-stop-started": ("a stop begins when the train stands", OFF),
-    "railsignal-moving-block": ("trains are kept apart in moving block anyway", OFF),
     "device.rerouting.probability": ("trains keep their routes", OFF),
     "device.rerouting.explicit": ("trains keep their routes", OFF),
     "ignore-route-errors": ("routes must be connected", OFF),
@@ -169,10 +169,6 @@ NAMED: Mapping[tuple[str, str], tuple[str, frozenset[str]] | Refused] = {
 #: Whole elements of route and additional files that are not followed, in which words.
 ELEMENTS_NAMED: Mapping[str, str | Refused] = {
     "calibrator": "no train is let in or taken out by it",
-    "railSignalConstraints": "trains go first come, first served",
-    "tlLogic": "signals are not obeyed; our own interlocking keeps trains apart",
-    "WAUT": "signals are not obeyed; our own interlocking keeps trains apart",
-    "wautJunction": "signals are not obeyed; our own interlocking keeps trains apart",
     "vaporizer": "nobody is taken out by it",
     "overheadWire": "overhead wires are not modelled",
     "tractionSubstation": "overhead wires are not modelled",
@@ -182,6 +178,14 @@ ELEMENTS_NAMED: Mapping[str, str | Refused] = {
     "relation": "they say nothing of a train here",
     "deadlock": "our own interlocking keeps trains apart",
 }  # fmt: skip
+
+#: Whole elements of additional files that are followed where signals are obeyed, and why they are not where they are ignored.
+ELEMENTS_OF_SIGNALS: Mapping[str, str] = {
+    "railSignalConstraints": "trains go first come, first served",
+    "tlLogic": "signals are not obeyed; our own interlocking keeps trains apart",
+    "WAUT": "signals are not obeyed; our own interlocking keeps trains apart",
+    "wautJunction": "signals are not obeyed; our own interlocking keeps trains apart",
+}
 
 #: Whole elements of additional files that are followed.
 ELEMENTS_FOLLOWED = _words("variableSpeedSign rerouter")
@@ -258,7 +262,7 @@ def of_others(elements: Iterable[Element], unread: Iterable[Element]) -> list[st
 
     ``unread`` are those in route files that SUMO reads in additional files alone.
     """
-    passed = ELEMENTS.keys() | ELEMENTS_FOLLOWED | ELEMENTS_OF_NO_EFFECT
+    passed = ELEMENTS.keys() | ELEMENTS_FOLLOWED | ELEMENTS_OF_NO_EFFECT | ELEMENTS_OF_SIGNALS.keys()
     counts = Counter(e.tag for e in elements if e.tag not in passed)
     lines = []
     for tag, n in counts.items():
@@ -273,13 +277,22 @@ def of_net(net: NetFile) -> list[str]:
     """What a net says that is not followed, one line for each."""
     counts = Counter(_unknown(net))
     lines = [f"net: {n} x {what}: not followed: {UNKNOWN}" for what, n in counts.items()]
-    signals = sum(j.attributes.get("type") == "rail_signal" for j in net.junctions)
-    if signals:
-        lines.append(f"net: {signals} x rail signals: not obeyed: our own interlocking keeps trains apart in moving block")
     lights = sum(j.attributes.get("type", "").startswith("traffic_light") for j in net.junctions)
     if lights:
         lines.append(f"net: {lights} x traffic lights: not obeyed")
     return lines
+
+
+def of_signals(signals: int, options: Mapping[str, str], elements: Iterable[Element]) -> list[str]:
+    """What is said of rail signals and all that belongs to them where they are not obeyed, one line for each."""
+    lines = (
+        [f"net: {signals} x rail signals: not obeyed: our own interlocking keeps trains apart in moving block"] if signals else []
+    )
+    value = options.get("railsignal-moving-block", "")
+    if value not in OFF:
+        lines.append(f"option railsignal-moving-block = {value}: not followed: trains are kept apart in moving block anyway")
+    counts = Counter(e.tag for e in elements if e.tag in ELEMENTS_OF_SIGNALS)
+    return [*lines, *(f"{n} x <{tag}>: not followed: {ELEMENTS_OF_SIGNALS[tag]}" for tag, n in counts.items())]
 
 
 def _unknown(net: NetFile) -> Iterator[str]:

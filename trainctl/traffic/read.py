@@ -32,8 +32,10 @@ from trainctl.traffic.files import (
     routes_of,
     seconds,
 )
+from trainctl.traffic.handed import Source
 from trainctl.traffic.kinds import Kind, default_types, kind_of
 from trainctl.traffic.places import YES, Area, Place, Tracks, area_of, off_route, place_of, read_tracks, unconnected, unmarked
+from trainctl.traffic.rail_signals import Signal, rail_signals
 from trainctl.traffic.scale import scaled
 from trainctl.traffic.speed_signs import Change, speed_signs
 from trainctl.traffic.trial import in_doubt, tried
@@ -96,6 +98,9 @@ class Configuration(NamedTuple):
     signs: tuple[Change, ...]  # variable speed signs
     closings: tuple[Closing, ...]
     drawn: tuple[str, ...]  # flows whose departures are drawn
+    signals: tuple[Signal, ...]  # rail signals of the net, by the tracks that they guard
+    junctions: int  # so many of its junctions have some
+    source: Source  # what SUMO may be handed of the files
 
 
 def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, seed: int = 42) -> Configuration:
@@ -174,6 +179,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
     made = {vehicle.get("id", "") for vehicle in expanded}
     made |= {name.rpartition(".")[0] for name in made}
     departures = []
+    handed: dict[str, tuple[Element, Element, tuple[str, ...]]] = {}
     wrong = [
         f"{'flow' if t.tag == 'flow' else 'train'} {t.get('id')}: duarouter makes no route of it; are all its edges for its vClass?"
         for t in trains
@@ -187,6 +193,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
             continue
         train, mistakes = _departure(vehicle, source, kind, elements, tracks, speed, seed)
         departures.append((order[source.get("id", "")], train))
+        handed[name] = vehicle, source, train.edges
         wrong += mistakes
     if wrong:
         raise InputError(list(dict.fromkeys(wrong)))
@@ -212,6 +219,9 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         signs=tuple(signs),
         closings=tuple(closed),
         drawn=tuple(t.get("id", "") for t in trains if "probability" in t.attrib or t.get("period", "").startswith("exp")),
+        signals=rail_signals(tracks.file),
+        junctions=sum(j.attributes.get("type") == "rail_signal" for j in tracks.file.junctions),
+        source=Source(options, elements, handed),
     )
 
 

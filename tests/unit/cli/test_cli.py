@@ -13,6 +13,7 @@ import pytest
 import tomli_w
 
 from trainctl.cli import console
+from trainctl.cli import program as cli
 from trainctl.cli.console import number
 from trainctl.record.folder import run_name
 from trainctl.scenario.reading import read
@@ -191,3 +192,11 @@ def test_scenarios_runs_and_keys_are_completed(folder, monkeypatch):
     assert "topology.loss=" in console.settable("topology.l") and console.settable("x") == []
     Path("my.toml").write_text("")
     assert "my.toml" in console.scenario_names("m")
+
+
+@pytest.mark.parametrize("command", ["check", "run", "schema", "sweep", "resume"])
+def test_help_says_where_a_laws_file_is_executed(command, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["trainctl", command, "--help"])
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert "A law that is a file is a program: it is executed." in " ".join(capsys.readouterr().out.split())

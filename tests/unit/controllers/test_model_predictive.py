@@ -63,7 +63,7 @@ def test_a_feasible_plan_keeps_every_constraint(spacing, v, v_l, steps, seed) ->
         found = string.step(first_brakes(3, 0.6) if k % 3 else None)
         for i in (1, 2):
             if found.saturated[i]:
-                assert found.acceleration[i] == -min(0.8, own[i, 1])
+                assert found.acceleration[i] == -min(1.0, own[i, 1])
             else:
                 feasible += 1
                 check_plan(string, own, before, sent, i)
@@ -75,7 +75,7 @@ def test_where_nothing_is_feasible_a_train_brakes_fully_and_says_so() -> None:
     string.own[1, 0] = -(LENGTH_M + 5.0)  # within the margin already
     found = string.step()
     assert found.saturated.tolist() == [False, True]
-    assert found.acceleration[1] == -0.8
+    assert found.acceleration[1] == -1.0
 
 
 def test_a_train_that_is_braked_by_somebody_else_sends_that_it_brakes() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from trainctl.ensemble.stack import alone, kind, stacked
-from trainctl.ensemble.steps import points
+from trainctl.ensemble.steps import simulated
 from trainctl.runner import run
 from trainctl.scenario.build import open_scenario
 
@@ -50,6 +50,12 @@ CASES = {
     ),
     "sliding": ("robust_constrained", {"controller": {"law": "sliding_mode"}, "run.duration_s": 80, "topology.loss": 0.2}),
     "predictive": ("robust_constrained", {"controller": {"law": "model_predictive"}, "run.duration_s": 16, "topology.loss": 0.2}),
+    "finite_time": ("emu_finite_time", {"run.duration_s": 15}),
+    "force_limits": ("emu_force_limits", {"run.duration_s": 10, "bounds.coupler_lower_m": -0.001, "bounds.coupler_upper_m": 0.001}),
+    "fault_tolerant": ("fault_tolerant", {"run.duration_s": 12, "run.record_every_s": 2.0}),
+    "intermediate": ("fault_tolerant_intermediate", {"run.duration_s": 8}),
+    "shared": ("three_tracks", {**DISTURBED, "run.duration_s": 30}),
+    "by_radio": ("emu_finite_time", {"run.duration_s": 10, "topology.communication_period_s": 0.5, "topology.loss": 0.3}),
     "cycle": ("robust_constrained_cycle", {"run.duration_s": 80}),
 }
 
@@ -84,12 +90,12 @@ def test_every_run_has_the_numbers_it_has_alone(case, tmp_path):
     runs = models(*CASES[case], 4)
     assert [alone(p) for p in runs] == [None] * 4
     assert len({repr(kind(p)) for p in runs}) == 1
-    done = points(stacked(runs))
-    n = len(runs[0].scenario.ids)
+    done = simulated(stacked(runs))
+    units = len(runs[0].own)
     for r, p in enumerate(runs):
         one = run(p, tmp_path / str(r), "numeric")
         last = one.trains[one.trains["time_s"] == one.trains["time_s"].max()]
-        assert np.array_equal(done.own[r * n : (r + 1) * n, 1], last["speed_mps"])
+        assert np.array_equal(done.own[r * units + p.leading, 1], last["speed_mps"])
         assert done.why_alone[r] is None
         assert (done.violations[r], done.overspeeds[r]) == (one.info["violations"], one.info["overspeeds"])
         known = {k: v for k, v in one.metrics.items() if "/" not in k and isinstance(v, int | float)}
@@ -104,7 +110,7 @@ def test_every_run_has_the_numbers_it_has_alone(case, tmp_path):
 
 def test_the_cases_violate_something_and_are_too_fast_somewhere():
     """Else the counts above would be compared where there are none."""
-    done = points(stacked(models(*CASES["outside"], 4)))
+    done = simulated(stacked(models(*CASES["outside"], 4)))
     assert done.violations.min() >= 6
     assert done.overspeeds.max() >= 1
     assert max(done.metrics[f"bounds.spacing_{side}_margin_m"].min() for side in ("lower", "upper")) < 0.0
@@ -112,7 +118,7 @@ def test_the_cases_violate_something_and_are_too_fast_somewhere():
 
 def test_a_run_does_not_depend_on_those_beside_it():
     runs = models(*CASES["fully_distributed"], 5)
-    many, few = points(stacked(runs)), points(stacked(runs[3:]))
+    many, few = simulated(stacked(runs)), simulated(stacked(runs[3:]))
     for key, value in few.metrics.items():
         assert np.array_equal(value, many.metrics[key][3:], equal_nan=True), key
 
@@ -126,7 +132,7 @@ def test_a_run_does_not_depend_on_those_beside_it():
             {"event": [{"kind": "reroute", "train": 2, "crossover": "leave", "time_s": 9.0}]},
             "events on the way",
         ),
-        ("three_tracks", {}, "of units"),
+        ("fault_tolerant_noise", {}, "noise"),
         ("merging", {}, "come and go"),
     ],
 )
@@ -145,8 +151,8 @@ def test_runs_that_leave_the_common_course_are_named():
         return open_scenario("robust_constrained", {**calm, "train": trains})
 
     sound, rams = with_second(18500.0, 0.0), with_second(26800.0, 80.0)
-    done = points(stacked(share([sound, rams, sound])))
+    done = simulated(stacked(share([sound, rams, sound])))
     assert done.why_alone == (None, "trains touch or pass one another", None)
     assert np.array_equal(done.metrics["formation.overshoot_m"][0], done.metrics["formation.overshoot_m"][2])
     crossing = open_scenario("fully_distributed", {"run.duration_s": 1100})
-    assert points(stacked([crossing])).why_alone == ("a train changes track",)
+    assert simulated(stacked([crossing])).why_alone == ("a train changes track",)

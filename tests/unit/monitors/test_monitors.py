@@ -242,7 +242,7 @@ def test_ten_thousand_trains_are_watched_in_milliseconds(units):
     bounds = type(units.bounds)(*(np.full(n, b[0]) for b in units.bounds))
     p = SimpleNamespace(
         scenario=scenario, consists=c, bounds=bounds, law=units.law, sampled=True, own=own, leading=c.first[:-1],
-        roster=SimpleNamespace(speed_factor=np.ones(n)), placed=True, has_units=True, driving=units.driving, line=units.line,
+        roster=SimpleNamespace(speed_factor=np.ones(n), driven=np.zeros(n, bool)), placed=True, has_units=True, driving=units.driving, line=units.line,
         signs=units.signs, rails=replace(units.rails, length_m=1e8 * np.ones_like(units.rails.length_m)),
     )  # fmt: skip
     k = np.arange(n - 1)

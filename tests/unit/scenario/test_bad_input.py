@@ -249,3 +249,50 @@ def test_a_folder_whose_name_sumo_cannot_read_is_refused(typed, tmp_path):
     code, lines = typed("run", "fully_distributed", "--out", "a,b")
     assert code == 2 and len(lines) == 1 and "a comma for the end of a file's name" in lines[0]
     assert not list(tmp_path.glob("a*"))
+
+
+def test_mistakes_of_all_kinds_come_in_one_round(tmp_path, typed):
+    """Tables that cannot be read, names and keys of law and plant, tracks and places on the line."""
+    (tmp_path / "s.toml").write_text(
+        """
+schema_version = 1
+title = 5
+[run]
+duration_s = -1.0
+[network]
+line = "three_tracks"
+[controller]
+law = "fully_distributed"
+joined = "ratchet"
+[observer]
+kind = "nobody"
+[plant]
+kind = "points"
+[topology]
+spacing_m = 1000.0
+[[train]]
+id = "a"
+type = "e"
+track = 9
+position_m = -5.0
+speed_mps = 80.0
+[train_type.e]
+unit_mas_kg = 5e4
+"""
+    )
+    code, told = typed("check", "s.toml")
+    assert code == 2
+    for mistake in (
+        "title = 5: input should be", "run.duration_s = -1.0: input should be", "reference: missing", "train_type.e.unit_mas_kg: unknown key",
+        "train_type.e.unit_mass_kg: missing", "controller.joined: unknown key", "observer.kind = nobody: no such", "plant.kind = points: no such",
+        "train[a].track = 9: no such track", "train[a].position_m = -5: off the line",
+    ):  # fmt: skip
+        assert sum(f"s.toml: {mistake}" in line for line in told) == 1, (mistake, told)
+
+
+def test_a_line_that_is_not_there_is_told_with_the_rest(tmp_path, typed):
+    (tmp_path / "s.toml").write_text(
+        'extends = "fully_distributed"\ntitle = 5\n[run]\nduration_s = "x"\n[network]\nline = "nowhere.toml"\n'
+    )
+    code, told = typed("check", "s.toml")
+    assert (code, len(told)) == (2, 3) and any("nowhere.toml" in line for line in told)

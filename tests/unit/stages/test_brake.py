@@ -114,4 +114,4 @@ def test_the_loop_s_state_has_what_acts(finished):
     loop, _ = started(open_scenario("time_headway", {**SHORT, **brake()}))
     while loop.time < 12.0:
         loop.step()
-    assert loop.state.orders.braking == (1,) and loop.state.own[0, SPEED] < 59.5
+    assert loop.state.orders.acting == (1,) and loop.state.own[0, SPEED] < 59.5

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -11,14 +12,15 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
+import trainctl
 from trainctl.cli.program import app
 from trainctl.figures.overlay import QUANTITIES, overlay, scale
 from trainctl.figures.trains import drawable
-from trainctl.laws import laws
+from trainctl.laws import find_law, laws
 from trainctl.runs.run import Run
 from trainctl.scenario.build import model_of
 from trainctl.scenario.reading import examine, find, read
-from trainctl.studies.compare import alternatives, figures, latex, names, table
+from trainctl.studies.compare import alternatives, figures, latex, names, others, table
 
 
 @pytest.fixture(scope="module")
@@ -144,3 +146,63 @@ def test_the_table_in_latex(runs):
         r"a\_b & m/s$^2$ & $0.0123$ & -- \\", r"c &  & $18\,600$ & $3.00 \cdot 10^{-9}$ \\", r"\bottomrule", r"\end{tabular}",
     ]  # fmt: skip
     assert len(latex(table(runs), ["a", "b"]).splitlines()) == len(table(runs)) + 7
+
+
+OWN = """extends = "time_headway"
+title = "A law of its own, and gains for others"
+
+[run]
+duration_s = 20
+sub_step_s = 0.1
+
+[controller]
+law = "{law}"
+
+[alternative.time_headway]
+gain_per_s = 0.2
+
+[alternative.sliding_mode]
+reach_mps2 = 5.0
+"""
+
+
+@pytest.fixture
+def own(tmp_path):
+    """A scenario with a law in a file beside it, and another law elsewhere that does not compile."""
+    (tmp_path / "mine").mkdir()
+    template = (Path(trainctl.__file__).parent / "templates" / "my_law.py").read_text()
+    (tmp_path / "mine" / "my_law.py").write_text(template)
+    (tmp_path / "slow_law.py").write_text(template.replace("0.02", "0.01"))
+    (tmp_path / "broken.py").write_text("def violations(")
+    (tmp_path / "mine" / "own.toml").write_text(OWN.replace("{law}", "my_law.py"))
+    return tmp_path
+
+
+def test_the_scenarios_own_law_laws_in_files_and_those_of_others_are_rows(own, monkeypatch):
+    data, path = read(str(own / "mine" / "own.toml"))
+    found, left_out = others(data, [*laws(), "installed"], path.parent, [str(own / "slow_law.py"), str(own / "broken.py")])
+    assert list(found) == ["my_law", "slow_law"]
+    assert found["my_law"] == data
+    assert find_law(found["slow_law"]["controller"]["law"]).Params().k_per_s == 0.01
+    assert "cannot be imported: SyntaxError" in left_out["broken"][0] and "no such law" in left_out["installed"][0]
+    shippeds = alternatives(data, laws())
+    assert shippeds["time_headway"]["controller"] == {"law": "time_headway", "gain_per_s": 0.2}
+    assert shippeds["time_headway_cooperative"]["controller"] == {"law": "time_headway", "acceleration_share": 0.8}
+
+
+def test_an_alternative_that_nobody_runs_is_a_mistake(own, typed):
+    text = (own / "mine" / "own.toml").read_text().replace("[alternative.time_headway]", "[alternative.nobody]")
+    (own / "mine" / "own.toml").write_text(text)
+    status, said = typed("compare", own / "mine" / "own.toml", "--controllers", "all", "--backend", "numeric")
+    assert status == 2 and len(said) == 1 and said[0].startswith("own.toml: alternative.nobody: no such row; there are: fully_")
+    assert typed("compare", "a", "--law", "b.py") == (2, ["--law: only with --controllers all, which runs something"])
+
+
+def test_gains_are_stated_and_who_is_left_out(own, monkeypatch, capsys):
+    monkeypatch.setattr("trainctl.laws.laws", lambda: ["sliding_mode", "time_headway"])
+    typed = ["compare", str(own / "mine" / "own.toml"), "--controllers", "all", "--backend", "numeric", "--out", str(own / "out")]
+    done = CliRunner().invoke(app, [*typed, "--law", str(own / "slow_law.py")], catch_exceptions=False)
+    assert done.exit_code == 0
+    assert "time_headway: time_headway on coupled_units: gain_per_s = 0.2" in done.stdout
+    assert "my_law: my_law.py on coupled_units" in done.stdout and "slow_law: " in done.stdout
+    assert "sliding_mode is left out: own.toml: controller.reach_mps2 = 5: unstable" in done.stdout

@@ -63,6 +63,13 @@ def test_equal_spacing_closes_the_hole():
     assert row(links, 3, 1) == (-5000.0, -10000.0, -100.0)
 
 
+def test_with_equal_spacing_the_slots_are_those_of_each_track():
+    links = made(plan(equal=True, first_slot=-100.0), [1, 3, 1, 1, 3, 1])
+    np.testing.assert_allclose(links.slot, [-100.0, -100.0, -5100.0, -10100.0, -5100.0, -15100.0])
+    np.testing.assert_allclose(links.desired, links.slot[links.sender] - links.slot[links.receiver])
+    assert made(plan(), [1, 3, 1, 1, 3, 1]).slot.tolist() == [0.0, -5000.0, -10000.0, -15000.0, -20000.0, -25000.0]
+
+
 def test_extra_links_exist_only_while_both_are_on_one_track():
     p = plan(extra=((0, 2), (3, 5)))
     assert ["1", "3"] in graph.edges(made(p, [1, 1, 1, 1, 2, 1]), IDS)
@@ -102,7 +109,7 @@ def deliveries(radio, links, count):
     """Which links heard in so many exchanges, and the messages after them; train i says k in exchange k."""
     messages, heard, position = silent(), [], np.arange(6.0) * -1000.0
     for k in range(count):
-        messages, now = deliver(radio, messages, np.full((6, 1), float(k)), position, links, k)
+        messages, now = deliver(radio, messages, np.full((6, 1), float(k)), position, links, k, float(k), position)
         heard.append(now)
     return np.array(heard), messages
 
@@ -131,7 +138,7 @@ def test_a_lost_message_leaves_the_last_one_in_place():
     messages = silent()
     for k in range(50):
         before = messages
-        messages, heard = deliver(radio, before, np.full((6, 1), float(k)), np.zeros(6), links, k)
+        messages, heard = deliver(radio, before, np.full((6, 1), float(k)), np.zeros(6), links, k, 0.0, np.zeros(6))
         assert np.all(messages.heard[heard] == k)
         if k:
             assert np.array_equal(messages.heard[~heard], before.heard[~heard])
@@ -142,7 +149,7 @@ def test_an_exchange_leaves_the_messages_before_as_they_were():
     links, radio = made(plan(), [1] * 6), seeded(0.5, 1, np.inf, 3, NAMES)
     messages = deliveries(radio, links, 5)[1]
     sent, heard, ever = [s.copy() for s in messages.sent], messages.heard.copy(), messages.ever.copy()
-    later, _ = deliver(radio, messages, np.full((6, 1), 9.0), np.zeros(6), links, 5)
+    later, _ = deliver(radio, messages, np.full((6, 1), 9.0), np.zeros(6), links, 5, 0.0, np.zeros(6))
     assert [s.tolist() for s in messages.sent] == [s.tolist() for s in sent]
     assert np.array_equal(messages.heard, heard) and np.array_equal(messages.ever, ever)
     assert not np.array_equal(later.heard, heard)
@@ -160,14 +167,16 @@ def test_delay_counts_exchanges():
 def test_messages_end_at_the_range():
     links = made(plan(), [1] * 6)
     position = np.array([0.0, -1000.0, -3000.0, -4000.0, -5000.0, -6000.0])
-    _, heard = deliver(seeded(0.0, 0, 1500.0, 0, NAMES), silent(), np.zeros((6, 1)), position, links, 0)
+    _, heard = deliver(seeded(0.0, 0, 1500.0, 0, NAMES), silent(), np.zeros((6, 1)), position, links, 0, 0.0, position)
     pairs = {frozenset((int(s), int(r))) for s, r, h in zip(links.sender, links.receiver, heard, strict=True) if not h}
     assert pairs == {frozenset((1, 2))}
 
 
 def test_what_was_heard_stays_with_its_link_when_the_graph_changes():
     before, after = made(plan(), [1, 1, 1, 1, 2, 1]), made(plan(), [1, 3, 1, 1, 1, 1])
-    messages, _ = deliver(seeded(0.0, 0, np.inf, 0, NAMES), silent(), np.arange(6.0)[:, None], np.zeros(6), before, 0)
+    messages, _ = deliver(
+        seeded(0.0, 0, np.inf, 0, NAMES), silent(), np.arange(6.0)[:, None], np.zeros(6), before, 0, 0.0, np.zeros(6)
+    )
     messages = relinked(messages, before, after)
     heard = {
         (int(s), int(r)): (v, e)
@@ -183,7 +192,7 @@ def test_a_link_that_has_received_once_stays_one_whatever_is_lost_and_however_th
     messages, radio = silent(), seeded(0.5, 0, np.inf, 1, NAMES)
     received, last = np.zeros(len(before.sender), bool), np.zeros(len(before.sender))
     for k in range(1, 3):
-        messages, heard = deliver(radio, messages, 10.0 * k + np.arange(6.0)[:, None], np.zeros(6), before, k)
+        messages, heard = deliver(radio, messages, 10.0 * k + np.arange(6.0)[:, None], np.zeros(6), before, k, 0.0, np.zeros(6))
         received |= heard
         last[heard] = 10.0 * k + before.sender[heard]
         np.testing.assert_array_equal(messages.ever, received)

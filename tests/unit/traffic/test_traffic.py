@@ -109,7 +109,7 @@ def test_the_same_seed_draws_the_same(files: Files) -> None:
     )
     one, same = files.read(demand), files.read(demand)
     other = read_traffic(files.sumocfg, files.folder / "work", seed=7)
-    assert one == same
+    assert one._replace(source=same.source) == same
     assert one.departures != other.departures
     assert {d.kind for d in one.departures} == {"m1", "m2", "t"} == set(one.kinds)
     assert {d.edges for d in one.departures} == {("ab", "bc", "cd"), ("xb", "bc")}

@@ -1,0 +1,302 @@
+"""Rail signals obeyed by our trains, alone and beside trains of SUMO's own; the same files in plain SUMO are the measure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import nets
+import pytest
+import tomli_w
+from beside import OPEN, plain
+
+from trainctl.errors import InputError
+from trainctl.runner import opened, resume, run
+from trainctl.runs.run import Run
+from trainctl.scenario.build import open_scenario
+
+#: What must never be told of trains that obey.
+AMISS = ("violation", "red_passed", "green_withdrawn", "gridlock", "sumo_warning", "not_entered")
+
+
+def ran(folder: Path, duration: float, order: list[Any] | None = None, out: str = "out", **driving: Any) -> Run:
+    made = nets.scenario("robust_constrained", duration, traffic={"cooperate": [], **driving})
+    made |= {"order": order} if order else {}
+    (folder / "s.toml").write_text(tomli_w.dumps(made))
+    return run(open_scenario(str(folder / "s.toml")), folder / out, force=True)
+
+
+def at(found: Run, kind: str) -> dict[str, float]:
+    """When each train had its first event of a kind [s]."""
+    return {e["train"]: e["time_s"] for e in reversed(found.events) if e["kind"] == kind}
+
+
+def order_of(times: dict[str, float]) -> list[str]:
+    return sorted(times, key=lambda name: times[name])
+
+
+def amiss(found: Run) -> list[dict[str, Any]]:
+    return [e for e in found.events if e["kind"] in AMISS]
+
+
+def also(folder: Path, additional: str, options: str = "") -> None:
+    """Give the configuration of a folder an additional file, and options."""
+    (folder / "b.add.xml").write_text(f"<additional>{additional}</additional>")
+    path = folder / "a.sumocfg"
+    path.write_text(path.read_text().replace(OPEN, f'{OPEN}<additional-files value="b.add.xml"/>{options}'))
+
+
+def join(folder: Path, body: str, signals: str = "wsmx") -> None:
+    """Two lines that merge, with a signal wherever tracks meet or part and between."""
+    net = {
+        "west0": ("w0", "w"), "west": ("w", "m"), "south0": ("s0", "s"), "south": ("s", "m"), "main": ("m", "x"), "east": ("x", "e"),
+    }  # fmt: skip
+    places = {"w0": (-3000, 0), "w": (0, 0), "s0": (-3000, -3000), "s": (0, -3000), "m": (4000, 0), "x": (6000, 0), "e": (12000, 0)}
+    nets.net(folder, places, net, signals=signals)
+    nets.traffic(folder, body)
+
+
+WEST, SOUTH = "west0 west main east", "south0 south main east"
+
+
+def constraint(signal: str, kind: str, train: str, at: str, foe: str) -> str:
+    inside = f'<{kind} tripId="{train}" tl="{at}" foes="{foe}"/>'
+    return f'<railSignalConstraints id="{signal}">{inside}</railSignalConstraints>'
+
+
+def test_trains_that_obey_pass_a_join_one_after_the_other_and_are_told_why_they_wait(tmp_path):
+    join(tmp_path, nets.flow("w", WEST, 3, 60) + nets.flow("s", SOUTH, 3, 60, 30))
+    found = ran(tmp_path, 1700, signals="obey")
+    assert len(at(found, "arrive")) == 6 and not amiss(found) and found.ok
+    held = [e for e in found.events if e["kind"] == "signal"]
+    assert held and all(e["other"] not in (None, e["train"]) and e["signal"] in "wsmx" for e in held)
+    rows = found.trains.astype({"train": str, "edge": str})
+    on = rows[rows.edge == "main"].groupby("time_s").train.nunique()
+    assert on.max() == 1  # one train between two signals
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        (nets.train("a", WEST, 0) + nets.train("b", SOUTH, 60), constraint("m", "predecessor", "a", "m", "b")),
+        (nets.train("a", WEST, 0) + nets.train("b", SOUTH, 60), constraint("w", "predecessor", "a", "x", "b")),
+        (nets.train("a", WEST, 0) + nets.train("b", SOUTH, 60), constraint("w", "insertionPredecessor", "a", "s", "b")),
+        (nets.train("a", WEST, 0) + nets.train("b", SOUTH, 60), constraint("w", "insertionOrder", "a", "s", "b")),
+        (nets.train("a", WEST, 0) + nets.train("b", SOUTH, 200), constraint("m", "foeInsertion", "a", "s", "b")),
+        (nets.train("a", WEST, 0, "<param key='tripId' value='first'/>") + nets.train("b", SOUTH, 60),
+         constraint("m", "predecessor", "first", "m", "b")),
+        (nets.train("up", nets.UP, 0) + nets.train("down", nets.DOWN, 100), constraint("2", "predecessor", "up", "3", "down")),
+        (nets.train("up", nets.UP, 0) + nets.train("down", nets.DOWN, 100), constraint("2", "bidiPredecessor", "up", "3", "down")),
+    ],
+    ids=["predecessor", "far", "insertionPredecessor", "insertionOrder", "foeInsertion", "trip", "single_track", "bidiPredecessor"],
+)  # fmt: skip
+def test_constraints_are_kept_as_in_plain_sumo(tmp_path, body, said):
+    make = join if "west0" in body else lambda folder, body: nets.single_track(folder, body, signals="1234")
+    times = {}
+    for name, additional in (("free", ""), ("bound", said)):
+        folder = tmp_path / name
+        folder.mkdir()
+        make(folder, body)
+        also(folder, additional)
+        found = ran(folder, 1500, signals="obey")
+        assert not amiss(found)
+        times[name] = at(found, "arrive") if "foeInsertion" not in said else at(found, "depart") | {"a": passed(found, "a", "main")}
+        theirs = {row["id"]: float(row["arrival"]) for row in plain(folder, "tripinfo")}
+        assert order_of(at(found, "arrive")) == order_of(theirs) and len(theirs) == 2
+    assert order_of(times["free"]) != order_of(times["bound"])
+
+
+def passed(found: Run, train: str, edge: str) -> float:
+    """When a train came to an edge [s]."""
+    rows = found.trains.astype({"train": str, "edge": str})
+    return float(rows[(rows.train == train) & (rows.edge == edge)].time_s.min())
+
+
+def test_orders_of_the_scenario_are_handed_to_the_signals(tmp_path):
+    join(tmp_path, nets.train("a", WEST, 0) + nets.train("b", SOUTH, 60) + nets.train("c", WEST, 120))
+    free = ran(tmp_path, 1500, signals="obey")
+    assert order_of(at(free, "arrive"))[0] == "a"
+    found = ran(tmp_path, 1500, [{"edge": "main", "trains": ["b", "a"]}], signals="obey")
+    assert order_of(at(found, "arrive")) == ["b", "a", "c"] and not amiss(found)
+    with pytest.raises(InputError, match=r"order\[1\].trains: d: no rail signal on its way before edge main"):
+        join(tmp_path, nets.train("a", WEST, 0) + nets.train("d", "main east", 60, departPos=200))
+        ran(tmp_path, 1500, [{"edge": "main", "trains": ["d", "a"]}], signals="obey")
+
+
+def test_a_train_at_its_platform_asks_for_no_signal(tmp_path):
+    """It stands before the single track for 400 s; one that comes the other way meanwhile has it."""
+    halt = '<stop lane="up1_0" endPos="1990" duration="400"/>'
+    arrived = {}
+    for name, body in (("alone", ""), ("both", nets.train("up", nets.UP, 0, halt))):
+        (tmp_path / name).mkdir()
+        nets.single_track(tmp_path / name, body + nets.train("down", nets.DOWN, 200), signals="1234")
+        found = ran(tmp_path / name, 1400, signals="obey")
+        arrived[name] = at(found, "arrive")
+        assert not amiss(found)
+    assert abs(arrived["both"]["down"] - arrived["alone"]["down"]) < 5.0
+    assert at(found, "stop_left")["up"] - at(found, "stop_reached")["up"] == 400.0
+
+
+def line(folder: Path, trains: int, ours: int, spacing: float = 100.0) -> list[str]:
+    """Trains of SUMO's Rail model on a line with a signal every 2 km and a station; every so many-th is ours: which."""
+    nodes = {f"n{k}": (2000.0 * k, 0.0) for k in range(9)}
+    edges = {f"e{k}": (f"n{k}", f"n{k + 1}") for k in range(8)}
+    nets.net(folder, nodes, edges, signals=[f"n{k}" for k in range(1, 8)])
+    kind = '<vType id="rail" vClass="rail" carFollowModel="Rail" trainType="RB425" maxSpeed="40"/>'
+    stop = '<stop lane="e4_0" endPos="1900" duration="30"/>'
+    names = [f"{'ours' if k % ours == ours - 1 else 'sumo'}.{k}" for k in range(trains)]
+    body = "".join(nets.train(name, " ".join(edges), spacing * k, stop, type="rail") for k, name in enumerate(names))
+    nets.traffic(folder, body, kind)
+    return [name for name in names if name.startswith("ours")]
+
+
+def test_a_line_with_a_third_of_our_trains_on_it(tmp_path):
+    """Nobody touches anybody, all arrive, and trains of SUMO's ahead of all of ours move as in plain SUMO."""
+    ours = line(tmp_path, 10, 3)
+    made = {"cooperate": ["ours.*"], "others": "sumo"}
+    (tmp_path / "s.toml").write_text(
+        tomli_w.dumps(nets.scenario("robust_constrained", 2400, types=(), traffic=made, plant={"input_lower_mps2": -0.9}))
+    )
+    p = open_scenario(str(tmp_path / "s.toml"))
+    assert p.roster.driven.sum() == 7 and p.obeys and p.scenario.traffic.signals == "obey"
+    assert any("traffic.signals = obey: chosen since SUMO drives 7 of 10 trains" in note for note in p.roster.notes)
+    found = run(p, tmp_path / "out")
+    assert len(at(found, "arrive")) == 10 and not amiss(found) and found.ok
+    assert {e["train"] for e in found.events if e["kind"] == "stop_reached"} == set(p.scenario.ids)
+    plain(tmp_path, "fcd", "--precision", "9")
+    rows = found.trains.astype({"train": str, "edge": str})
+    positions = fcd(tmp_path / "plain.xml")
+    ahead = [name for name in p.scenario.ids if int(name.split(".")[1]) < int(ours[0].split(".")[1])]
+    assert ahead == ["sumo.0", "sumo.1"]
+    begin = dict(zip(p.rails.edges, p.rails.start_m.tolist(), strict=True))
+    for name in ahead:
+        mine = rows[rows.train == name].set_index("time_s").position_m
+        theirs = {t: begin[edge] + place for t, (edge, place) in positions[name].items()}
+        assert len(mine) > 400 and set(mine.index) == set(theirs)
+        assert max(abs(float(x) - theirs[t]) for t, x in mine.items()) < 1e-6
+    inputs = rows.assign(theirs=~rows.train.isin(ours)).groupby("theirs").input_mps2
+    assert inputs.count()[True] == 0 and inputs.count()[False] > 0  # what moves them nobody tells us
+
+
+def fcd(path: Path) -> dict[str, dict[float, tuple[str, float]]]:
+    """Edge and place on it [m] by train and time, of an FCD log."""
+    return {
+        name: {
+            float(step.get("time", "nan")): (v.get("lane", "").rpartition("_")[0], float(v.get("pos", "nan"))) for step, v in rows
+        }
+        for name, rows in _rows(path).items()
+    }
+
+
+def _rows(path: Path) -> dict[str, list[tuple[Element, Element]]]:
+    found: dict[str, list[tuple[Element, Element]]] = {}
+    for step in ElementTree.parse(path).getroot():
+        for vehicle in step:
+            found.setdefault(vehicle.get("id", ""), []).append((step, vehicle))
+    return found
+
+
+#: SUMO's ICE3 as one unit: its forces fitted to the table, with brakes that surely give its 0.5 m/s2.
+ICE3 = {
+    "unit_length_m": 200.0, "unit_mass_kg": 420e3, "rotating_mass_factor": 1.04, "c0_n_per_kg": 7.414 / 420, "c1_ns_per_m_kg": 0.05191 / 420,
+    "c2_ns2_per_m2_kg": 0.008664 / 420, "traction_n": 292e3, "traction_power_w": 7827.71e3, "braking_n": 0.51 * 420e3 * 1.04,
+}  # fmt: skip
+
+
+def test_the_undisturbed_headway_of_fixed_block_is_that_of_sumo(tmp_path):
+    """Pairs of trains closer and closer: how close a follower may be that no red slows down, with SUMO's own forces and braking."""
+    nodes = {f"n{k}": (2000.0 * k + (2000.0 if k else 0.0), 0.0) for k in range(6)}
+    edges = {f"e{k}": (f"n{k}", f"n{k + 1}", {"speed": 50}) for k in range(5)}
+    nets.net(tmp_path, nodes, edges, signals=[f"n{k}" for k in range(1, 5)])
+    headways = (87, 89, 90, 91, 92, 93, 94)
+    way = " ".join(edges)
+    body = "".join(nets.train(f"a{h}", way, 500 * k) + nets.train(f"b{h}", way, 500 * k + h) for k, h in enumerate(headways))
+    nets.traffic(tmp_path, body, '<vType id="emu" vClass="rail" carFollowModel="Rail" trainType="ICE3" maxSpeed="50"/>')
+    duration = 500 * len(headways) + 100
+    bounds = {"speed_upper_mps": 60.0, "input_lower_mps2": -0.5, "input_upper_mps2": 0.3}
+    made = nets.scenario(
+        "robust_constrained", duration, (), reference={"speed_mps": 50.0}, bounds=bounds, train_type={"emu": ICE3},
+        supervisor={"margin_m": 0.0, "emergency_mps2": 0.5, "service_mps2": 0.5},
+        traffic={"signals": "obey", "cooperate": [], "acceleration_mps2": 1.0, "deceleration_mps2": 0.5, "below_limit_mps": 0.0},
+    )  # fmt: skip
+    made["plant"] = {"kind": "coupled_units"}
+    theirs = {key: made[key] for key in ("schema_version", "title", "run", "network", "reference", "topology")}
+    free = {}
+    for name, scenario in (("ours", made), ("sumo", {**theirs, "controller": {"law": "sumo"}})):
+        (tmp_path / f"{name}.toml").write_text(tomli_w.dumps(scenario))
+        found = run(open_scenario(str(tmp_path / f"{name}.toml")), tmp_path / name)
+        left, came = at(found, "arrive"), at(found, "depart")
+        late = {h: left[f"b{h}"] - came[f"b{h}"] - (left[f"a{h}"] - came[f"a{h}"]) for h in headways}
+        assert late[headways[0]] > 0.0 and late[headways[-1]] == 0.0
+        free[name] = min(h for h in headways if late[h] == 0.0)
+    assert abs(free["ours"] - free["sumo"]) <= 2, free
+
+
+@pytest.mark.parametrize("others", ["driven", "sumo"])
+def test_a_run_with_signals_resumes_to_the_byte(tmp_path, others):
+    join(tmp_path, nets.flow("w", WEST, 2, 60) + nets.flow("s", SOUTH, 2, 60, 30))
+    made = nets.scenario("robust_constrained", 600, traffic={"cooperate": ["w.*"], "others": others, "signals": "obey"})
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(made))
+    p = open_scenario(str(tmp_path / "s.toml"))
+    whole = run(p, tmp_path / "whole")
+
+    with pytest.raises(ConnectionError), opened(p, tmp_path / "cut", checkpoint_every_s=100.0) as simulation:
+        for _ in range(450):
+            simulation.step()
+        raise ConnectionError
+    again, since = resume(tmp_path / "cut")
+    assert since == 400.0
+    for name in ("trains.parquet", "events.jsonl", "metrics.json"):
+        assert (whole.folder / name).read_bytes() == (again.folder / name).read_bytes(), name
+
+
+@pytest.mark.parametrize(
+    ("signals", "driving", "told"),
+    [
+        ("wsmx", {"signals": "stop"}, ["traffic.signals = stop: "]),
+        ("", {"signals": "obey"}, ["no rail signal stands before edge main for train a and 1 more", "the net has no rail signals"]),
+        ("", {"others": "sumo"}, ["traffic.others = sumo: no rail signal stands before edge main for train a and 1 more"]),
+        ("wx", {"others": "sumo"}, ["no rail signal stands before edge main for train b"]),
+        ("wsmx", {"others": "sumo", "signals": "ignore"}, ['traffic.signals = ignore: not with others = "sumo"']),
+    ],
+)
+def test_what_signals_cannot_decide_is_refused(tmp_path, typed, signals, driving, told):
+    join(tmp_path / "n", nets.train("a", WEST, 0) + nets.train("b", SOUTH, 60), signals)
+    made = nets.scenario("robust_constrained", 500, traffic={"cooperate": ["a"], **driving})
+    (tmp_path / "n" / "s.toml").write_text(tomli_w.dumps(made))
+    code, lines = typed("check", tmp_path / "n" / "s.toml")[:2]
+    assert code == 2
+    assert len(lines) == len(told) and all(part in line for part, line in zip(told, lines, strict=True)), lines
+
+
+def test_signals_are_for_sumo_alone(tmp_path, typed):
+    join(tmp_path / "n", nets.train("a", WEST, 0) + nets.train("b", SOUTH, 60))
+    for driving, key in (({"signals": "obey"}, 'signals = "obey"'), ({"others": "sumo"}, 'others = "sumo"')):
+        made = nets.scenario("robust_constrained", 500, traffic={"cooperate": ["a"], **driving})
+        (tmp_path / "n" / "s.toml").write_text(tomli_w.dumps(made))
+        code, lines = typed("run", tmp_path / "n" / "s.toml", "--backend", "numeric")
+        assert code == 2 and [f"traffic.{key}: SUMO sets the signals: no --backend numeric, no --gui" in lines[0]] == [True], lines
+
+
+@pytest.mark.parametrize(
+    ("signals", "cooperate", "obeys", "said"),
+    [
+        ("wsmx", ["*"], False, "4 x rail signals: not obeyed"),
+        ("wsmx", ["a"], True, "traffic.signals = obey: chosen since 1 of 2 trains do not cooperate"),
+        (
+            "wx",
+            ["a"],
+            False,
+            "traffic.signals = ignore: chosen though not every train cooperates: no rail signal stands before edge main",
+        ),
+        ("", ["a"], False, None),
+    ],
+)
+def test_what_is_chosen_is_said(tmp_path, signals, cooperate, obeys, said):
+    join(tmp_path, nets.train("a", WEST, 0) + nets.train("b", SOUTH, 60), signals)
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(nets.scenario("robust_constrained", 500, traffic={"cooperate": cooperate})))
+    p = open_scenario(str(tmp_path / "s.toml"))
+    assert p.obeys is obeys
+    assert any(said in note for note in p.roster.notes) if said else not any("signals" in note for note in p.roster.notes)

@@ -1,0 +1,145 @@
+"""Trains of SUMO's own beside ours, and signals that all of them obey: what is chosen, and where it cannot be.
+
+Where signals are obeyed they alone decide who goes first and who has single track: our interlocking then grants nothing, since two
+authorities, each with a part of what two trains need, could hold both up for ever. So every place that two trains may want at once
+must have a signal before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from itertools import pairwise
+from typing import Literal
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+from sumo_net import Rails
+from trainctl.scenario.events import Order
+from trainctl.scenario.tables import TrafficTable
+from trainctl.signals import Bools, Ints
+from trainctl.traffic.rail_signals import Signal
+
+#: More edges than this are counted, not named.
+MOST = 5
+
+
+def chosen(
+    driving: TrafficTable, together: Bools, signals: Sequence[Signal], bare: Sequence[str]
+) -> tuple[Literal["ignore", "obey"], list[str], list[str]]:
+    """Whether signals are obeyed, what is to be told of that, and what is wrong with it.
+
+    Parameters
+    ----------
+    driving : TrafficTable
+        What the scenario says.
+    together : ndarray of bool, shape (n,)
+        Trains that cooperate.
+    signals : sequence of Signal
+        Rail signals of the net.
+    bare : sequence of str
+        Places without a signal before them, as ``unguarded`` names them.
+    """
+    alone = int((~together).sum())
+    sumo = driving.others == "sumo" and alone > 0
+    if driving.signals == "ignore":
+        wrong = (
+            'traffic.signals = ignore: not with others = "sumo": SUMO\'s trains obey them and ours would not, so that two'
+            " authorities could hold each other up for ever"
+        )
+        return "ignore", [], [wrong] if sumo else []
+    if driving.signals is None and not sumo and (not signals or not alone):
+        return "ignore", [], []
+    if driving.signals is None and not sumo and bare:
+        why = f'though not every train cooperates: no rail signal stands {bare[0]}; give it one, or say signals = "obey"'
+        return "ignore", [f"traffic.signals = ignore: chosen {why} to hear of all such places"], []
+    of = "traffic.signals = obey" if driving.signals else "traffic.others = sumo"
+    wrongs = [f"{of}: no rail signal stands {one}: who goes first there would be decided by nobody" for one in bare]
+    if driving.signals == "obey" and not signals:
+        wrongs.append("traffic.signals = obey: the net has no rail signals")
+    if driving.signals or wrongs:
+        return "obey", [], wrongs
+    why = f"SUMO drives {alone} of {len(together)} trains" if sumo else f"{alone} of {len(together)} trains do not cooperate"
+    other = "" if sumo else '; signals = "ignore" is the other way'
+    return "obey", [f"traffic.signals = obey: chosen since {why}{other}"], []
+
+
+def unguarded(ways: Sequence[Ints], ids: Sequence[str], rails: Rails, signals: Sequence[Signal]) -> list[str]:
+    """Joins and single track that two trains use, and that some train comes to without a rail signal before it.
+
+    A train that begins there needs none: SUMO does not let it in before the place is free.
+    """
+    stands = {(rails.index.get(s.edge, -1), rails.index.get(s.onward, -1)) for s in signals}
+    users: dict[int, int] = {}
+    over: dict[int, set[int]] = {}  # edges that lead into each, as far as trains come over them
+    for way in ways:
+        for edge in set(way.tolist()):
+            users[edge] = users.get(edge, 0) + 1
+        for a, b in zip(way[:-1].tolist(), way[1:].tolist(), strict=True):
+            over.setdefault(b, set()).add(a)
+    single = {
+        e for e in users if any(other in users for other in (int(rails.twin[e]), *rails.crossing[e]) if other >= 0)
+    }  # fmt: skip
+    found: dict[int, list[str]] = {}
+    for name, way in zip(ids, ways, strict=True):
+        guarded, last = False, int(way[0])
+        begun = last in single  # still on the stretch it begins on
+        for k, edge in enumerate(way.tolist()):
+            if k and not guarded:
+                onward = next((e for e in way[k:].tolist() if not rails.internal[e]), -1)
+                guarded = not rails.internal[last] and (last, onward) in stands
+            begun &= edge in single
+            shared = (k > 0 and len(over[edge]) > 1) or edge in single
+            if shared and not guarded and not begun and k > 0:
+                found.setdefault(edge, []).append(name)
+            last = edge
+    named = [f"before edge {rails.edges[e]} for train {_some(trains)}" for e, trains in found.items()]
+    return named if len(named) <= MOST else [*named[:MOST], f"before {len(named) - MOST} more edges"]
+
+
+def constraints(
+    orders: Sequence[Order], routes: Mapping[str, Sequence[str]], trips: Mapping[str, str], rails: Rails, signals: Sequence[Signal]
+) -> tuple[list[str], list[str]]:
+    """Orders of the scenario as constraints of SUMO's signals, and where no signal could keep them.
+
+    Parameters
+    ----------
+    orders : sequence of Order
+        As in the scenario, free of the mistakes ``passages`` finds.
+    routes, trips : mapping
+        Edges of the way of every train, internal ones included, and what constraints call it.
+    rails : Rails
+        The net.
+    signals : sequence of Signal
+        Its signals.
+
+    Returns
+    -------
+    tuple of list of str
+        Elements of an additional file; mistakes, one line each.
+    """
+    at = {(one.edge, one.onward): one.name for one in signals}
+    found, wrong = [], []
+    for k, order in enumerate(orders, 1):
+        here = rails.index[order.edge]
+        edges = {order.edge, *([rails.edges[int(rails.twin[here])]] if rails.twin[here] >= 0 else [])}
+        before = {i: _before(routes[i], edges, rails, at) for i in order.trains}
+        wrong += [f"order[{k}].trains: {i}: no rail signal on its way before edge {order.edge} could keep the order"
+                  for i, name in before.items() if name is None]  # fmt: skip
+        for a, b in pairwise(order.trains):
+            if (foe := before[a]) and (own := before[b]):
+                said = {"tripId": trips[b], "tl": foe, "foes": trips[a], "limit": str(len(routes))}
+                element = Element("railSignalConstraints", {"id": own})
+                element.append(Element("predecessor", said))
+                found.append(ElementTree.tostring(element, "unicode"))
+    return found, wrong
+
+
+def _before(route: Sequence[str], edges: Collection[str], rails: Rails, at: Mapping[tuple[str, str], str]) -> str | None:
+    """The last signal on a route before the first of these edges, None if there is none."""
+    normal = [e for e in route[: next(k for k, e in enumerate(route) if e in edges) + 1] if not rails.internal[rails.index[e]]]
+    names = [at[pair] for pair in pairwise(normal) if pair in at]
+    return names[-1] if names else None
+
+
+def _some(trains: Sequence[str]) -> str:
+    return trains[0] if len(trains) == 1 else f"{trains[0]} and {len(trains) - 1} more"

@@ -1,0 +1,118 @@
+"""Rail signals, where they are obeyed: how far each train may go before one that is red to it.
+
+They alone decide then who goes first, and who has single track: our interlocking grants nothing beside them.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from trainctl.railway import aspects, supervisor
+from trainctl.railway.interlocking import Held
+from trainctl.railway.ways import Ways
+from trainctl.scenario.model import Model
+from trainctl.signals import Floats, Ints, Seen
+from trainctl.stages.record import Journal
+from trainctl.stages.traffic import State as Traffic
+from trainctl.world import SignalBox
+
+#: A train that is slower stands [m/s], and at a signal if that is no farther away [m].
+STANDS_MPS, AT_M = 0.05, 10.0
+
+#: Signals are looked at so much farther ahead than the way in which a train may have to stop [m].
+BEYOND_M = 1000.0
+
+
+class State(NamedTuple):
+    """What is remembered of signals."""
+
+    aspects: aspects.State
+    at: Ints  # (n,) red signal that every train stands at, as was told, -1: none
+
+
+class Signals:
+    """The signals of a run."""
+
+    def __init__(self, p: Model, journal: Journal) -> None:
+        self.p, self.journal = p, journal
+        index = p.rails.index
+        self.numbers = {
+            (index[one.edge], index[one.onward]): k
+            for k, one in enumerate(p.roster.signals)
+            if one.edge in index and one.onward in index
+        }
+        self.rate = np.minimum(p.driver_rules.service_mps2, p.relied_on_by_driver.braking)
+        # How far ahead of a train that enters a signal may matter.
+        self.entering = supervisor.stopping_distance(p.cruise, self.rate, p.scenario.run.step_s, p.step_theta) + BEYOND_M
+        self.ways: Ways | None = None
+
+    def initial(self) -> State:
+        """Nothing seen yet."""
+        n = len(self.p.scenario.ids)
+        return State(aspects.none(len(self.p.roster.signals), n), np.full(n, -1))
+
+    def step(
+        self, t: float, ways: Ways, seen: Seen, speed: Floats, traffic: Traffic, box: SignalBox | None, s: State
+    ) -> tuple[State, Held | None]:  # fmt: skip
+        """How far every train may go before a signal; None where nobody obeys them.
+
+        Parameters
+        ----------
+        t : float
+            Now [s].
+        ways : Ways
+            Of all n trains.
+        seen, speed : Seen, ndarray, shape (n,)
+            Where the trains are, and how fast [m/s].
+        traffic : traffic.State
+            Who has come, and stands at a stop. Who has not may go up to the first signal on its way, once it comes.
+        box : SignalBox or None
+            Whoever sets the signals.
+        s : State
+            A step ago.
+        """
+        if box is None:
+            return s, None
+        at = self._table(ways)
+        step, v = self.p.scenario.run.step_s, np.maximum(speed, 0.0)
+        braking = supervisor.stopping_distance(v, self.rate, step, self.p.step_theta)
+        farthest = float(np.max(braking + 10.0 * step * v, where=seen.present, initial=0.0)) + BEYOND_M
+        horizon = np.where(seen.present, farthest, self.entering)
+        sighted = aspects.sighted(ways, at, seen.row, seen.position, seen.present | ~traffic.came, horizon)
+        green = np.zeros(len(sighted.train), bool)
+        known = seen.present[sighted.train]
+        signals, which = np.unique(sighted.signal[known], return_inverse=True)
+        green[known] = box.green(signals)[which]
+        now, held, told = aspects.decide(ways, sighted, green, seen.position, seen.present, braking, s.aspects)
+        ids, roster = self.p.scenario.ids, self.p.roster
+        for one in (one for one in told if not roster.driven[one.train]):
+            name = roster.signals[one.signal].name
+            if one.passed:
+                self.journal.event(t, "red_passed", train=ids[one.train], signal=name, speed_mps=float(speed[one.train]))
+            else:
+                self.journal.event(
+                    t, "green_withdrawn", train=ids[one.train], signal=name, room_m=one.room, braking_m=float(braking[one.train])
+                )  # fmt: skip
+        stands = seen.present & (v < STANDS_MPS) & (held.room < AT_M) & (now.red >= 0) & ~traffic.standing
+        for i in np.flatnonzero(stands & (held.by < 0)).tolist():
+            held.by[i] = box.blocker(int(now.red[i]))
+        stand = np.where(stands, now.red, -1)
+        for i in np.flatnonzero((stand >= 0) & (stand != s.at)).tolist():
+            other = ids[held.by[i]] if held.by[i] >= 0 else None
+            self.journal.event(t, "signal", train=ids[i], signal=roster.signals[stand[i]].name, other=other)
+        return State(now, stand), held
+
+    def before(self, ways: Ways, seen: Seen) -> Held:
+        """How far trains may go before anything is known of any signal: up to the first one."""
+        n = len(seen.row)
+        sighted = aspects.sighted(ways, self._table(ways), seen.row, seen.position, np.ones(n, bool), self.entering)
+        none, nobody = np.zeros(len(sighted.train), bool), np.zeros(n, bool)
+        return aspects.decide(ways, sighted, none, seen.position, nobody, np.zeros(n), self.initial().aspects)[1]
+
+    def _table(self, ways: Ways) -> Ints:
+        """Signals along the ways, made anew where these have changed."""
+        if self.ways is not ways:
+            self.ways, self.at = ways, aspects.table(ways, self.p.rails.internal, self.numbers)
+        return self.at

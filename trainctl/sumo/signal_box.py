@@ -1,0 +1,149 @@
+"""SUMO as a signal box: rail signals that trains of ours obey, and trains of SUMO's own among them.
+
+Of whoever obeys SUMO's driver plans every step, so that it asks for signals, with the deceleration the train brakes with; what that
+driver wants is overruled all the same. SUMO lets nobody in before the block is free.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from trainctl.errors import CouplingError
+from trainctl.railway.ways import Ways, rerouted
+from trainctl.scenario.model import Model
+from trainctl.signals import Bools, Floats, Ints, Seen
+from trainctl.traffic.handed import Handed
+
+if TYPE_CHECKING:
+    from sumo_net import Rails
+    from trainctl.sumo.session import Session
+
+#: Options of ours that do not hold where trains of SUMO's run, or are let in as SUMO does it.
+NOT_WITH_SIGNALS = ("insertion-checks", "default.speeddev")
+
+
+class Obeyed(NamedTuple):
+    """What a session needs to know where signals are obeyed."""
+
+    handed: Handed
+    driven: Bools  # (n,) trains that SUMO drives
+    signals: tuple[tuple[str, int], ...]  # program and link of every signal, by its number
+    braking: Floats  # (n,) m/s2, what trains of ours brake with
+    rails: Rails
+
+
+def obeyed(p: Model) -> Obeyed | None:
+    """The same of a scenario; None where nobody obeys signals."""
+    handed = p.roster.handed
+    if handed is None:
+        return None
+    signals = tuple((one.name, one.link) for one in p.roster.signals)
+    rate = np.minimum(p.driver_rules.service_mps2, p.relied_on_by_driver.braking)
+    return Obeyed(handed, p.roster.driven, signals, rate, p.rails)
+
+
+def write(obeyed: Obeyed, folder: Path) -> dict[str, str]:
+    """Write the files that SUMO is handed beside our trains; its options that name them, and those of the configuration."""
+    handed = obeyed.handed
+    (folder / "own.rou.xml").write_text("\n".join(["<routes>", *handed.types, *handed.vehicles, "</routes>", ""]), encoding="utf-8")
+    (folder / "own.add.xml").write_text("\n".join(["<additional>", *handed.additional, "</additional>", ""]), encoding="utf-8")
+    return {**dict(handed.options), "route-files": "trains.rou.xml,own.rou.xml", "additional-files": "own.add.xml"}
+
+
+class Read(NamedTuple):
+    """Trains that SUMO drives."""
+
+    train: Ints
+    row: Ints
+    position: Floats  # m
+    present: Bools
+
+    def within(self, seen: Seen, ways: Ways) -> Seen:
+        """What is seen of all trains, with these."""
+        for whole, part in ((seen.row, self.row), (seen.position, self.position), (seen.present, self.present)):
+            whole[self.train] = part
+        return seen._replace(edge=ways.edge[seen.row])
+
+
+class Box:
+    """The signals of a session that runs, and its trains that SUMO drives."""
+
+    def __init__(self, session: Session, obeyed: Obeyed) -> None:
+        self.session, self.obeyed = session, obeyed
+        self.number = {name: i for i, name in enumerate(session.ids)}
+        self.own = np.flatnonzero(obeyed.driven)
+        self.speed = np.full(len(session.ids), np.nan)
+        self.state = session.api.trafficlight.getRedYellowGreenState
+
+    def green(self, signals: Ints) -> Bools:
+        """Whether signals show green, by their numbers."""
+        shown: dict[str, str] = {}
+        found = np.zeros(len(signals), bool)
+        for k, signal in enumerate(signals.tolist()):
+            name, link = self.obeyed.signals[signal]
+            if name not in shown:
+                shown[name] = self.state(name)
+            found[k] = shown[name][link] in "Gg"
+        return found
+
+    def blocker(self, signal: int) -> int:
+        """A train because of which a signal is red, -1 if SUMO names none."""
+        name, link = self.obeyed.signals[signal]
+        lights = self.session.api.trafficlight
+        for ask in (lights.getBlockingVehicles, lights.getRivalVehicles, lights.getPriorityVehicles):
+            for train in ask(name, link):
+                if train in self.number:
+                    return self.number[train]
+        return -1
+
+    def speeds(self) -> Floats:
+        """Speeds of the trains that SUMO drives [m/s], NaN of the others."""
+        return self.speed
+
+    def read(self) -> Read:
+        """Where the trains that SUMO drives are now; the session's ways and rows follow those that it leads another way."""
+        vehicle, session = self.session.api.vehicle, self.session
+        there = set(vehicle.getIDList()) if len(self.own) else set()
+        present = np.array([session.ids[i] in there for i in self.own.tolist()], bool)
+        row, position = session.seen.row[self.own].copy(), session.seen.position[self.own].copy()
+        self.speed[self.own] = 0.0
+        for k in np.flatnonzero(present).tolist():
+            i = int(self.own[k])
+            name = session.ids[i]
+            row[k] = row_of(session, self.obeyed.rails, i, vehicle.getRoadID(name))
+            position[k] = session.ways.begin[row[k]] + vehicle.getLanePosition(name)
+            self.speed[i] = vehicle.getSpeed(name)
+        return Read(self.own, row, position, present)
+
+
+def row_of(session: Session, rails: Rails | None, i: int, edge: str) -> int:
+    """The row of the edge a train of SUMO's is on, from where it was on its way; SUMO may have given it another.
+
+    Then the way is taken over, and the rows in ``session.seen`` with it; ``rails`` None: it has no other.
+    """
+    for _ in range(2):
+        row, end = int(session.seen.row[i]), int(session.ways.first[i + 1])
+        onward = np.flatnonzero(session.ways.edge[row:end] == session.line.index.get(edge, -1))
+        if len(onward):
+            return row + int(onward[0])
+        if rails is not None:
+            _take_over(session, rails, i, edge)
+    raise CouplingError(f"train {session.ids[i]} left its way on edge {edge} at {session.now():.3f} s")
+
+
+def _take_over(session: Session, rails: Rails, i: int, edge: str) -> None:
+    """The way of a train that SUMO's own rerouters, or its routing, have changed, from the edge it was on."""
+    name, line, row, vehicle = session.ids[i], session.line, int(session.seen.row[i]), session.api.vehicle
+    route, at = vehicle.getRoute(name), vehicle.getRouteIndex(name)
+    was = line.edges[session.ways.edge[row]]
+    first = max(k for k in range(at + 1) if k == 0 or route[k] == was)
+    try:
+        way = rails.way(route[first:])
+    except ValueError as error:
+        raise CouplingError(f"train {name} on edge {edge} at {session.now():.3f} s: {error}") from None
+    before = session.ways.first
+    session.ways = rerouted(session.ways, i, row, way, line.start_m, line.length_m)
+    session.seen = session.seen._replace(row=session.seen.row + session.ways.first[:-1] - before[:-1])
