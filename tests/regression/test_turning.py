@@ -182,6 +182,24 @@ def test_a_train_longer_than_the_edge_turns_on_the_edges_it_runs_back_over(optio
     assert second["from_edge"] == "-ab"
 
 
+def test_a_train_turns_with_a_junction_under_it(tmp_path):
+    """SUMO leaves out the junctions under a train that turns; it is where it should be all the same, with either backend."""
+    nodes = {"a": (0, 0), "b": (1500, 0), "c": (2500, 0), "d": (3000, 0)}
+    edges = {**nets.both_ways("ab", "a", "b"), **nets.both_ways("bc", "b", "c"), **nets.both_ways("cd", "c", "d")}
+    branch = {"x": (2000, 500)}
+    nets.net(tmp_path, nodes | branch, edges | nets.both_ways("xc", "x", "c"), nets.TERMINALS)
+    types = nets.EMU.replace('length="100"', 'length="700"')
+    stop = '<stop lane="cd_0" endPos="400" duration="10"/>'
+    nets.traffic(tmp_path, nets.train("v", "ab bc cd -cd -bc -ab", 0, stop), types)
+    kind = nets.LAWS["robust_constrained"]["train_type"] | {"unit_length_m": 700.0}
+    p = opened_in(tmp_path, "robust_constrained", 400, train_type={"emu": kind})
+    assert p.rails.length_m[[p.rails.index[e] for e in (":c_0", ":c_1")]].max() > 1.0
+    found = both(p, tmp_path)
+    [turned], [left] = told(found, "turn"), told(found, "stop_left")
+    rows = found.trains.set_index("time_s")
+    assert turned["time_s"] == left["time_s"] and str(rows.edge[turned["time_s"] + 1.0]) == "-bc"
+
+
 def test_a_train_with_its_rear_inside_a_junction_goes_on_before_it_turns(tmp_path):
     stop = '<stop lane="bc_0" endPos="98" duration="10"/>'
     nets.terminals(tmp_path, nets.train("v", "ab bc -bc -ab", 0, stop), scale=0.25)

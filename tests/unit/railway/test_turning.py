@@ -36,11 +36,19 @@ def test_all_of_a_train_is_on_track_it_runs_back_over():
     assert not short.holds(1355.0) and short.holds(1356.0) and short.holds(1500.0) and not short.holds(1506.0)
     ways = {"back": np.array([3, 4, 5, 0, 1]), "twins": TWIN.copy()}
     long = turning.yard(UP, np.array([1000.0, 1300.0, 1306.0]), ways["back"], TWIN, INTERNAL, LENGTH, 220.0)
-    assert long.places[:, 0].tolist() == [1220.0] and long.last == pytest.approx(1506.0 - SHORT_M)  # its rear cannot come onto b
+    # Its front is on b and its rear cannot come there; it goes on by the 6 m of the junction before it turns.
+    assert long.places == pytest.approx(np.array([[1306.01, 1499.99]])) and turning.SPARE_M == 0.01
     assert not len(yard(220.0).places)  # two edges back, and three under the train: SUMO would not turn it
     assert not len(yard(200.0).places)  # 0.2 m short of the end it does not fit
+    assert turning.inside(DOWN, 150.0, INTERNAL, LENGTH) == 0.0 and turning.inside(DOWN, 260.0, INTERNAL, LENGTH) == 6.0
     gap = turning.yard(UP, np.array([1000.0, 1300.0, 1306.0]), ways["back"], TWIN, INTERNAL, LENGTH, 50.0)
-    assert gap.holds(1349.0) and not gap.holds(1353.0) and gap.next(1353.0) == 1356.0 and gap.next(1507.0) == np.inf
+    assert (
+        gap.holds(1343.0)
+        and not gap.holds(1345.0)
+        and not gap.holds(1353.0)
+        and gap.next(1353.0) == 1356.0
+        and gap.next(1507.0) == np.inf
+    )
     assert not len(yard(50.0, onward=np.array([5])).places)  # the way back is another track
 
 
