@@ -104,10 +104,10 @@ class Traffic:
         self.pairs = [
             (p.rails.index[order.edge], number[a], number[b]) for order in p.scenario.order for a, b in pairwise(order.trains)
         ]
+        self.settles = float(np.max(supervisor.settles(p.assumed, p.assumed.braking), initial=0.0))
         self.ways: Ways | None = None
         self._limits(0.0)
-        self.turns, self.stopping = Turns(p, self.net), stopping(p)
-        self.stops = list(p.roster.stops)
+        self.turns, self.stopping, self.stops = Turns(p, self.net, journal), stopping(p), list(p.roster.stops)
 
     def initial(self) -> State:
         """Before the run: trains that are placed have come."""
@@ -138,16 +138,22 @@ class Traffic:
         for i in [] if s.came.all() else np.flatnonzero(~s.came & self._given_up(t) & ~self._given_up(t - self.step_s)).tolist():
             self.journal.event(t, "given_up", train=self.p.scenario.ids[i], planned_s=float(self.roster.depart[i]))
         s, stops, soon = self._stops(t, seen, speed, overrun, s)
-        later = t + self.step_s
         if last:
             self._uncalled(s)
-        asking, reach = [] if last else [*self._returning(later, s), *self.due(later, s)], self._reach(speed)
-        s, held, entries, kept_out = self.entering(t, ways, s.on_track(seen), speed, s, asking, reach, red)
+        later = t + self.step_s
+        back = np.flatnonzero(s.parked & ~self.roster.driven & (s.stands_until <= later + 1e-9)).tolist()  # from where they park
+        asking, reach = [] if last else [*back, *self.due(later, s)], self._reach(speed)
+        s, held, entries, kept_out = self.entering(t, ways, s.on_track(seen), speed, s, asking, reach, red, self.step_s)
         present = s.on_track(seen).present.copy()
         present[[i for i, _ in entries]] = True
-        view = self._look(ways, seen._replace(present=present), speed, held, s, self._reach(speed) if entries else reach)
-        view = self.turns.ends(view, seen, overrun)
-        s, turns = self._turn(t, ways, seen, reach, [] if last else np.flatnonzero(stood & ~np.isnan(s.turns_since)).tolist(), s)
+        reach = self._reach(speed) if entries else reach
+        view = self.turns.ends(self._look(ways, seen._replace(present=present), speed, held, s, reach), seen, overrun)
+        ordered = None if self.p.obeys else lambda there, rows: self._ordered(t, there, seen._replace(row=rows), s)
+        asks = [] if last else np.flatnonzero(stood & ~np.isnan(s.turns_since)).tolist()
+        requests, now, turns = self.turns.step(
+            t, asks, ways, s.on_track(seen), reach, s.standing, s.requests, (s.leg, s.turns_since, s.kept_back), ordered
+        )  # fmt: skip
+        s = s._replace(requests=requests, leg=now[0], turns_since=now[1], kept_back=now[2])
         return s, Around(entries, stops, soon, held, kept_out, view, turns)
 
     def _take_over(self, ways: Ways, s: State) -> None:
@@ -163,25 +169,6 @@ class Traffic:
                 tuple(one._replace(place=moved(begun, ways, i, one.place)) if one.leg == s.leg[i] else one for one in stops)
                 for i, stops in enumerate(self.roster.stops)
             ]
-
-    def _turn(self, t: float, ways: Ways, seen: Seen, reach: Floats, asks: list[int], s: State) -> tuple[State, tuple[Turn, ...]]:
-        """Let trains turn that stand for it, where the way back is theirs."""
-        if not asks:
-            return s, ()
-        ordered = None if self.p.obeys else lambda there, rows: self._ordered(t, there, seen._replace(row=rows), s)
-        # Where signals decide, a train has its block, and its signal on the way back holds it.
-        asked = self.turns.ask(asks, ways, s.on_track(seen), reach, s.leg, s.standing, s.requests, ordered)
-        ids, edges, kept = self.p.scenario.ids, self.p.rails.edges, np.full(len(s.leg), -1)
-        kept[list(asked.kept)] = list(asked.kept.values())
-        for i, j in asked.kept.items():
-            if s.kept_back[i] != j:
-                self.journal.event(t, "turn_delayed", train=ids[i], edge=edges[int(seen.edge[i])], other=ids[j] if j >= 0 else None)
-        s = s._replace(requests=asked.requests, leg=s.leg.copy(), turns_since=s.turns_since.copy(), kept_back=kept)
-        for turn in asked.turns:
-            i = turn.train
-            s.leg[i], s.turns_since[i] = s.leg[i] + 1, np.nan
-            self.journal.event(t, "turn", train=ids[i], from_edge=edges[int(seen.edge[i])], to_edge=turn.edges[0])
-        return s, asked.turns
 
     # Arrivals and entries
 
@@ -227,9 +214,12 @@ class Traffic:
 
     def entering(
         self, t: float, ways: Ways, here: Seen, speed: Floats, s: State, due: Sequence[int], reach: Floats | None = None,
-        red: Held | None = None,
+        red: Held | None = None, after: float = 0.0,
     ) -> tuple[State, Held, tuple[tuple[int, float], ...], dict[int, int]]:  # fmt: skip
-        """Trains of those that are ``due`` whose place is clear, with the speed they come with [m/s]; who keeps out the others."""
+        """Trains of those that are ``due`` whose place is clear, with the speed they come with [m/s]; who keeps out the others.
+
+        They are there ``after`` so many seconds.
+        """
         self._take_over(ways, s)
         asking = np.zeros(len(speed), bool)
         asking[due] = True
@@ -252,7 +242,7 @@ class Traffic:
                 if present[i]:  # and stands for one more step, the one in which it comes back
                     s.parked[i], s.stands_until[i] = False, t + self.step_s
                 continue
-            v = self._entering_speed(i, ways, here, speed, view, held, s)
+            v = self._entering_speed(i, ways, here, speed, view, held, s, after)
             present[i] = v is not None
             if v is None:
                 kept_out[i] = waiting.kept_out(view, i)
@@ -263,7 +253,9 @@ class Traffic:
         keeping[list(kept_out)] = list(kept_out.values())
         return s._replace(came=came, entering=entering, kept_out=keeping), held, tuple(come), kept_out
 
-    def _entering_speed(self, i: int, ways: Ways, here: Seen, speed: Floats, view: View, held: Held, s: State) -> float | None:
+    def _entering_speed(
+        self, i: int, ways: Ways, here: Seen, speed: Floats, view: View, held: Held, s: State, after: float
+    ) -> float | None:
         """Speed with which a train can enter safely; None if it has to wait. ``view`` is that with the train at its place."""
         rules, v, roster = self.rules, self.roster.speed[i], self.roster
         limit = float(roster.speed_factor[i] * self.limit[roster.edge[i]])
@@ -283,6 +275,11 @@ class Traffic:
             planned = float(min(rules.service_mps2, self.assumed.braking[i]))
             left = np.array([min(room, FAR_M) - wanted * self.step_s])
             wanted = min(wanted, float(supervisor.greatest_speed(left, planned, self.step_s, self.theta)[0]))
+        own, fast = view.limits.train == i, np.full(len(speed), wanted)
+        braking = np.minimum(rules.service_mps2, self.assumed.braking)
+        limits = supervisor.Limits(*(column[own] for column in view.limits))
+        kept = supervisor.speed_for_limits(self.assumed, fast, limits, braking, self.step_s, self.theta)
+        wanted = float(min(wanted, *kept.tolist(), np.inf))
         ahead = authority.of(view.targets, (view.targets.train == i) & (view.targets.kind != supervisor.SIGNAL))
         stands = np.where(np.arange(len(speed)) == i, 0.0, speed)
         _, safe = supervisor.too_late(rules, self.assumed, stands, ahead, self.step_s, self.theta)
@@ -292,9 +289,19 @@ class Traffic:
         other = int(view.ahead.train[i])
         if other >= 0 and roster.cooperates[[i, other]].all() and view.ahead.spacing[i] < self.p.spacing.desired - 1.0:
             return None
-        if view.fouling[i] or np.any(view.clear.room[view.clear.other == i] < 0.0):  # another would be under it, or its tail
+        if view.fouling[i] or self._under(i, speed, view, after):
             return None
         return None if self._startles(i, entry, speed, view) else entry
+
+    def _under(self, i: int, speed: Floats, view: View, after: float) -> bool:
+        """Whether another would be under train ``i`` or its tail by the time it comes, ``after`` so many seconds.
+
+        Until then it makes no way, whatever its speed, and whoever follows it may run on.
+        """
+        met = authority.of(view.clear, view.clear.other == i)
+        gains = self.theta * (self.p.supervision.greatest_mps2 + self.assumed.scatter) * after
+        way = (np.maximum(speed, 0.0) + gains + self.assumed.drift) * after
+        return bool(np.any(met.room < np.where(met.kind == supervisor.TRAIN, way[met.train] + self.rules.margin_m, 0.0)))
 
     def _startles(self, i: int, entry: float, speed: Floats, view: View) -> bool:
         """Whether others would have to brake hard for a train that comes with the speed ``entry``."""
@@ -308,11 +315,6 @@ class Traffic:
             self.rules, trial, asked, clear, supervisor.no_limits(), self.step_s, self.theta, self.assumed, np.zeros(len(speed))
         )
         return bool(np.any(seen.emergency[view.targets.train[behind]]))
-
-    def _returning(self, t: float, s: State) -> list[int]:
-        """Trains that are parked and may go on."""
-        back: list[int] = np.flatnonzero(s.parked & ~self.roster.driven & (s.stands_until <= t + 1e-9)).tolist()
-        return back
 
     def _may_return(self, i: int, speed: Floats, view: View) -> bool:
         """Whether a parked train finds its place on the track free; ``view`` has it there."""
@@ -430,7 +432,9 @@ class Traffic:
         """Limit of every edge (E,) [m/s] that is to be kept over the coming step."""
         # A limit that falls while a train comes near asks for more than either alone: half the braking is kept for the way there.
         rate = 0.5 * float(np.min(self.requesting, initial=np.inf))
-        self.limit = signs.announced(self.p.signs, self.p.rails.speed_mps, t, self.step_s, rate)
+        shown, base = self.p.signs, self.p.rails.speed_mps
+        self.limit = signs.announced(shown, base, t, self.step_s, rate, self.settles)
+        self.falls = signs.falling(shown, base, t, self.step_s, self.limit)
 
     def _reach(self, speed: Floats) -> Floats:
         """How far ahead every train requests [m]: farther than it would brake for what it must not enter."""
@@ -483,13 +487,15 @@ class Traffic:
 
     def _look(self, ways: Ways, seen: Seen, speed: Floats, held: Held, s: State, reach: Floats) -> View:
         """What is ahead of every train."""
-        horizon = max(float(np.max(reach, where=seen.present, initial=0.0)) + 1000.0, self.join_range_m)
+        sees = 2.0 if self.falls.any() else 1.0  # half the braking, twice the way
+        horizon = max(sees * float(np.max(reach, where=seen.present, initial=0.0)) + 1000.0, self.join_range_m)
         if self.p.obeys:
             order = aspects.order(ways, self.net.joins, seen.row, seen.position, seen.present, horizon, held.room)
         else:
             order = interlocking.order(s.requests)
         # Trains that SUMO drives may stop as they like: whoever follows one keeps his whole braking distance.
         return authority.look(
-            ways, self.net, self.limit, self.roster.speed_factor, seen.row, seen.position, np.where(self.roster.driven, 0.0, speed),
-            self.length, seen.present, horizon, held.room, order, supervisor.SIGNAL if self.p.obeys else supervisor.SWITCH,
+            ways, self.net, self.limit, self.falls, self.roster.speed_factor, seen.row, seen.position,
+            np.where(self.roster.driven, 0.0, speed), self.length, seen.present, horizon, held.room, order,
+            supervisor.SIGNAL if self.p.obeys else supervisor.SWITCH,
         )  # fmt: skip

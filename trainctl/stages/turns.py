@@ -19,12 +19,17 @@ from trainctl.railway.ways import Ways, turned
 from trainctl.railway.ways import ways as laid
 from trainctl.scenario.model import Model
 from trainctl.signals import Bools, Floats, Ints, Seen
+from trainctl.stages.record import Journal
 
 #: A train aims this far into the track on which it may turn [m], if there is room.
 INTO_M = 2.0
 
 #: Who must let another train pass first, see ``interlocking.request``: from ways and rows of trains.
 Ordered = Callable[[Ways, Ints], list[tuple[int, int, int]]]
+
+
+#: How often every train has turned, since when it stands to turn [s] (NaN: it does not), and who keeps it from that (-1: nobody).
+Known = tuple[Ints, Floats, Ints]
 
 
 class Turn(NamedTuple):
@@ -46,8 +51,8 @@ class Asked(NamedTuple):
 class Turns:
     """The turns of a run. ``leg`` (n,) counts those that every train has made."""
 
-    def __init__(self, p: Model, net: along.Net) -> None:
-        self.p, self.net, self.length = p, net, p.consists.train_length()
+    def __init__(self, p: Model, net: along.Net, journal: Journal) -> None:
+        self.p, self.net, self.journal, self.length = p, net, journal, p.consists.train_length()
         index = p.line.index
         self.legs = [[np.array([index[e] for e in leg], np.int64) for leg in legs] for legs in p.roster.legs]
         self.last_leg = np.array([len(legs) - 1 for legs in self.legs], np.int64)
@@ -122,6 +127,25 @@ class Turns:
         """The farthest place at which a train that is to turn may stand [m]; inf: it is not to turn."""
         return self.yards[i].last if i in self.yards else float("inf")
 
+    def step(
+        self, t: float, asks: Sequence[int], ways: Ways, seen: Seen, reach: Floats, standing: Bools, requests: interlocking.State,
+        known: Known, ordered: Ordered | None,
+    ) -> tuple[interlocking.State, Known, tuple[Turn, ...]]:  # fmt: skip
+        """Let trains turn that stand for it and ask, where the way back is theirs; arguments as those of ``ask``."""
+        if not asks:
+            return requests, known, ()
+        asked = self.ask(asks, ways, seen, reach, known[0], standing, requests, ordered)
+        ids, edges = self.p.scenario.ids, self.p.rails.edges
+        leg, since, kept = known[0].copy(), known[1].copy(), np.full(len(ids), -1)
+        for i, j in asked.kept.items():
+            kept[i] = j
+            if known[2][i] != j:
+                self.journal.event(t, "turn_delayed", train=ids[i], edge=edges[int(seen.edge[i])], other=ids[j] if j >= 0 else None)
+        for i, onward, _ in asked.turns:
+            leg[i], since[i] = leg[i] + 1, np.nan
+            self.journal.event(t, "turn", train=ids[i], from_edge=edges[int(seen.edge[i])], to_edge=onward[0])
+        return asked.requests, (leg, since, kept), asked.turns
+
     def ask(
         self, trains: Sequence[int], ways: Ways, seen: Seen, reach: Floats, leg: Ints, standing: Bools,
         requests: interlocking.State, ordered: Ordered | None,
@@ -141,7 +165,7 @@ class Turns:
         requests : interlocking.State
             Of all trains.
         ordered : callable, optional
-            See ``Ordered``; None: signals decide, and nobody has to ask.
+            See ``Ordered``; None: signals decide. A train has its block then, and its signal on the way back holds it.
         """
         line, arrival = self.p.line, self.p.roster.arrival
         turns, kept, leg = [], dict[int, int](), leg.copy()
