@@ -141,18 +141,16 @@ class Traffic:
         if last:
             self._uncalled(s)
         later = t + self.step_s
-        back = np.flatnonzero(s.parked & ~self.roster.driven & (s.stands_until <= later + 1e-9)).tolist()  # from where they park
-        asking, reach = [] if last else [*back, *self.due(later, s)], self._reach(speed)
+        parked = s.parked & ~self.roster.driven & (s.stands_until <= later + 1e-9)  # who come back
+        asking, reach = [] if last else [*np.flatnonzero(parked).tolist(), *self.due(later, s)], self._reach(speed)
         s, held, entries, kept_out = self.entering(t, ways, s.on_track(seen), speed, s, asking, reach, red, self.step_s)
         present = s.on_track(seen).present.copy()
         present[[i for i, _ in entries]] = True
         reach = self._reach(speed) if entries else reach
         view = self.turns.ends(self._look(ways, seen._replace(present=present), speed, held, s, reach), seen, overrun)
         ordered = None if self.p.obeys else lambda there, rows: self._ordered(t, there, seen._replace(row=rows), s)
-        asks = [] if last else np.flatnonzero(stood & ~np.isnan(s.turns_since)).tolist()
-        requests, now, turns = self.turns.step(
-            t, asks, ways, s.on_track(seen), reach, s.standing, s.requests, (s.leg, s.turns_since, s.kept_back), ordered
-        )  # fmt: skip
+        asks, known = np.flatnonzero(stood & ~np.isnan(s.turns_since) & (not last)).tolist(), (s.leg, s.turns_since, s.kept_back)
+        requests, now, turns = self.turns.step(t, asks, ways, s.on_track(seen), reach, s.standing, s.requests, known, ordered)
         s = s._replace(requests=requests, leg=now[0], turns_since=now[1], kept_back=now[2])
         return s, Around(entries, stops, soon, held, kept_out, view, turns)
 
