@@ -67,6 +67,10 @@ def compare(
     spacing_m: Annotated[
         float | None, typer.Option(help="Desired spacing of the formations in m; default 3000.", rich_help_panel=CAPACITY)
     ] = None,
+    spacings: Annotated[
+        Path | None,
+        typer.Option(help="spacing.json of `trainctl compare spacing`: laws keep what it found.", rich_help_panel=CAPACITY),
+    ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Rows at a time; default one per core.", rich_help_panel=CAPACITY)
     ] = None,
@@ -117,7 +121,7 @@ def compare(
     if names == ["spacing"] and controllers is None:
         from trainctl.cli.spacing import spacing
 
-        others = {"length-km": length_km, "signals-m": signals_m, "spacing-m": spacing_m, "set": settings}
+        others = {"length-km": length_km, "signals-m": signals_m, "spacing-m": spacing_m, "spacings": spacings, "set": settings}
         idle = [f"--{key}" for key, value in others.items() if value] + ["--backend"] * (backend != "sumo")
         if idle:
             raise InputError([f"{option}: not with `trainctl compare spacing`" for option in idle])
@@ -132,11 +136,15 @@ def compare(
     if names == ["capacity"] and controllers is None:
         if settings or backend != "sumo":
             raise InputError("capacity: takes no --set and no --backend; its scenarios lie in --out afterwards")
-        chosen = {key: value for key, value in plan.items() if value is not None}
+        chosen: dict[str, Any] = {key: value for key, value in plan.items() if value is not None}
+        if spacings is not None:
+            from trainctl.studies.capacity import found_in
+
+            chosen["found"] = found_in(spacings)
         _capacity(chosen, out or Path("runs/capacity"), wanted, workers, as_json)
         return
     given = {"workers": workers, "trains": trains, "length-km": length_km, "speed-mps": speed_mps, "signals-m": signals_m}
-    given["spacing-m"] = spacing_m
+    given |= {"spacing-m": spacing_m, "spacings": spacings}
     if idle := [f"--{key}: only with `trainctl compare capacity`" for key, value in given.items() if value is not None]:
         raise InputError(idle)
     out = out or Path("runs/compare")
@@ -201,6 +209,9 @@ def _capacity(given: dict[str, Any], out: Path, formats: tuple[str, ...], worker
         for row in table:
             fill(shown, row["row"].replace("_", " "), *(number(row[key]) for key in list(capacity.COLUMNS.values())[1:]))
         show(shown)
+        for name in capacity.LAW_ROWS if plan.found else ():
+            if plan.found_of(name) is None:
+                say(f"{name}: no safe spacing was found; it runs at {plan.spacing_m:g} m")
         for path in pictures:
             say(path)
     failed = [f"{row['row']}: {row['error']}" for row in table if row["error"]]
