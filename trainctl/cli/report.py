@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from trainctl.runs.run import Run
 
 
-CAPACITY, SPACING = "compare capacity", "compare spacing"
+CAPACITY, SPACING, SUITE = "compare capacity", "compare spacing", "compare suite"
 
 
 def register(app: typer.Typer) -> None:
@@ -42,14 +42,14 @@ def compare(
         list[str],
         typer.Argument(
             metavar="RUN...",
-            help="Run folders; with --controllers all one scenario; or the word capacity or spacing (./capacity is a folder).",
+            help="Run folders; with --controllers all one scenario; or the word capacity, spacing or suite (./suite is a folder).",
         ),
     ],
     controllers: Annotated[
         Literal["all"] | None, typer.Option(help="all: run the scenario under every law that can drive its traffic, and compare.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Where figures and runs go; default runs/compare, runs/capacity, runs/spacing.")
+        Path | None, typer.Option(help="Where figures and runs go; default runs/compare, with a word runs/WORD.")
     ] = None,
     further: Annotated[
         list[str] | None, typer.Option("--law", metavar="FILE", help="With --controllers: a law in a file, too; repeatable.")
@@ -75,7 +75,7 @@ def compare(
         int | None, typer.Option(min=1, help="Rows at a time; default one per core.", rich_help_panel=CAPACITY)
     ] = None,
     rows_: Annotated[
-        str | None, typer.Option("--rows", metavar="ROW,...", help="Only these rows.", rich_help_panel=SPACING)
+        str | None, typer.Option("--rows", metavar="ROW,...", help="Only these rows; with suite too.", rich_help_panel=SPACING)
     ] = None,
     stops: Annotated[int | None, typer.Option(help="Emergency stops; default 200.", rich_help_panel=SPACING)] = None,
     searched: Annotated[
@@ -90,6 +90,8 @@ def compare(
     brake_scatter: Annotated[
         float | None, typer.Option(help="Share by which brakes scatter, either way; default 0.05.", rich_help_panel=SPACING)
     ] = None,
+    runs_: Annotated[int | None, typer.Option("--runs", help="Runs of each cell; default 20.", rich_help_panel=SUITE)] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the suite in --out.", rich_help_panel=SUITE)] = False,
     in_sumo: Annotated[
         bool, typer.Option("--in-sumo", help="Check the spacings that were found in SUMO as well.", rich_help_panel=SPACING)
     ] = False,
@@ -101,6 +103,9 @@ def compare(
 
     `trainctl compare spacing` finds for every law the smallest spacing at which nobody touches when the first train makes an
     emergency stop, in all of many stops with late and lost messages and brakes that scatter.
+
+    `trainctl compare suite` runs every law in every situation (join, leave, stop, emergency stop, outage, bursts, gradient, unit
+    lost), 20 times each, into one table and one page.
     """
     from trainctl.cli.console import listing, show, show_json
     from trainctl.runs.run import Run
@@ -121,14 +126,30 @@ def compare(
     if names == ["spacing"] and controllers is None:
         from trainctl.cli.spacing import spacing
 
-        others = {"length-km": length_km, "signals-m": signals_m, "spacing-m": spacing_m, "spacings": spacings, "set": settings}
-        idle = [f"--{key}" for key, value in others.items() if value] + ["--backend"] * (backend != "sumo")
+        others = {
+            "runs": runs_, "resume": resume or None, "length-km": length_km, "signals-m": signals_m, "spacing-m": spacing_m,
+            "spacings": spacings, "set": settings,
+        }  # fmt: skip
+        idle = [f"--{key}" for key, value in others.items() if value is not None] + ["--backend"] * (backend != "sumo")
         if idle:
             raise InputError([f"{option}: not with `trainctl compare spacing`" for option in idle])
         asked = {**of_spacing, "trains": trains, "speed_mps": speed_mps}
         asked = {key: value for key, value in asked.items() if value is not None}
         spacing(asked, rows_, out or Path("runs/spacing"), wanted, workers, as_json, in_sumo)
         return
+    if names == ["suite"] and controllers is None:
+        from trainctl.cli.suite import suite
+
+        options = {
+            **of_spacing, "trains": trains, "length-km": length_km, "speed-mps": speed_mps, "signals-m": signals_m,
+            "spacings": spacings, "set": settings, "in-sumo": in_sumo or None,
+        }  # fmt: skip
+        if idle := [f"--{key.replace('_', '-')}" for key, value in options.items() if value is not None]:
+            raise InputError([f"{option}: not with `trainctl compare suite`" for option in idle])
+        suite(runs_, spacing_m, rows_, out or Path("runs/suite"), workers, resume, as_json)
+        return
+    if runs_ is not None or resume:
+        raise InputError(f"--{'runs' if runs_ is not None else 'resume'}: only with `trainctl compare suite`")
     given: dict[str, Any] = {key.replace("_", "-"): value for key, value in of_spacing.items()}
     given |= {"rows": rows_, "in-sumo": in_sumo or None}
     if idle := [f"--{key}: only with `trainctl compare spacing`" for key, value in given.items() if value is not None]:
