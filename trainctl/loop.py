@@ -14,6 +14,7 @@ import numpy as np
 from trainctl.errors import LawError
 from trainctl.numeric import lay_out
 from trainctl.plants import disturbance
+from trainctl.railway import supervisor
 from trainctl.railway.ways import under
 from trainctl.scenario.events import Event
 from trainctl.scenario.model import Model
@@ -92,9 +93,14 @@ class Loop(Steps):
         own = self._measured(s)
 
         # orders: new routes first, since they change the rows of everybody
-        ordered, routes = self.orders.step(t, world.measure(), world.ways, own[leading, SPEED], s.formed.ahead, s.orders)
+        stops_in = supervisor.way_to_stop(
+            p.supervision, p.assumed, own[leading, SPEED], self.plant.acceleration(own), p.scenario.run.step_s, p.step_theta
+        )
+        ordered, routes = self.orders.step(
+            t, world.measure(), world.ways, own[leading, SPEED], stops_in, s.formed.ahead, s.orders
+        )  # fmt: skip
         stuck, led = self.rerouters.step(
-            t, world.measure(), world.ways, own[leading, SPEED], s.rerouters, [i for i, _ in routes]
+            t, world.measure(), world.ways, own[leading, SPEED], stops_in, s.rerouters, [i for i, _ in routes]
         )  # fmt: skip
         for i, edges in [*routes, *led]:
             world.route(i, edges)

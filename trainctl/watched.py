@@ -51,7 +51,7 @@ class Watched(Steps):
         super().__init__(model, journal)
         p, self.world = model, world
         # Nobody but the simulator protects these trains: their switches are locked within its braking distance.
-        rate = p.law.braking_mps2(p.params)
+        self.rate = rate = p.law.braking_mps2(p.params)
         protected = supervisor.Params(mode="on", service_mps2=rate, emergency_mps2=rate)
         ruled = replace(p, scenario=p.scenario.model_copy(update={"supervisor": protected}))
         self.orders, self.effort = orders.Orders(ruled, journal), Effort(p)
@@ -72,7 +72,10 @@ class Watched(Steps):
         """The state a step later."""
         world, now, t = self.world, self.world.measure(), self.time
         s = self._told(t, now, s)
-        ordered, routes = self.orders.step(t, now.seen, world.ways, now.speed, now.ahead, s.orders)
+        stops_in = supervisor.stopping_distance(
+            np.maximum(now.speed, 0.0), self.rate, self.p.scenario.run.step_s, self.p.step_theta
+        )
+        ordered, routes = self.orders.step(t, now.seen, world.ways, now.speed, stops_in, now.ahead, s.orders)
         for i, edges in routes:
             world.route(i, edges)
         now, ways = world.measure(), world.ways

@@ -72,6 +72,9 @@ REPLACED: dict[str, tuple[str | None, str]] = {
     "trainctl sweep fully_distributed --set topology.loss=0,0.1,0.2 --seeds 0..99": (
         "trainctl sweep fully_distributed --set topology.loss=0,0.1 --set run.duration_s=8 --seeds 0..0 --backend numeric"
         " --workers 1", "300 runs take too long"),
+    "trainctl tune robust_constrained --gain h_per_s=0.05..1 --objective settling=1,jerk=100 --set topology.loss=0.3 --seeds 0..19": (
+        "trainctl tune robust_constrained --gain h_per_s=0.05..1 --objective settling=1,jerk=100 --set topology.loss=0.3 --seeds 0..1"
+        " --set run.duration_s=40 --evaluations 16 --workers 1", "hundreds of candidates"),
     "trainctl sweep monte_carlo": (None, "hundreds of runs; that it can be read is tested in test_sweep.py"),
     'export SUMO_HOME=$(python -c "import sumo; print(sumo.SUMO_HOME)")': (None, "the test knows where it is"),
     "python $SUMO_HOME/tools/osmGet.py --bbox 9.00,47.30,9.45,47.45 --prefix region": (None, "it asks OpenStreetMap"),

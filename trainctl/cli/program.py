@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from trainctl.cli import cite, diff, extend, golden, net, report, resume, sweep
+from trainctl.cli import cite, diff, extend, golden, net, report, resume, sweep, tune
 from trainctl.cli.console import (
     DEFAULT_SCENARIO,
     Json,
@@ -299,6 +299,7 @@ net.register(networks)
 report.register(app)
 resume.register(app)
 sweep.register(app)
+tune.register(app)
 
 
 def _tell(lines: Iterable[str]) -> None:

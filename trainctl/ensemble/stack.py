@@ -16,6 +16,7 @@ from trainctl.plants import disturbance
 from trainctl.plants.disturbance import END as TABLE_END
 from trainctl.plants.disturbance import START as TABLE_START
 from trainctl.plants.disturbance import TRAIN, Signals
+from trainctl.railway import supervisor
 from trainctl.railway.ways import Ways, ways
 from trainctl.scenario.events import Event
 from trainctl.scenario.model import Model
@@ -166,8 +167,11 @@ def _routes(p: Model) -> list[tuple[str, ...]]:
             length=p.consists.train_length(), unit_length=[], routes=routes, present=np.ones(len(routes), bool), vclass=(),
         ))  # fmt: skip
         orders = Orders(p, _Unheard())
-        nobody = np.full(len(routes), -1)
-        _, given = orders.step(0.0, start.measure(), start.ways, p.own[p.leading, SPEED], nobody, orders.initial())
+        nobody, speed = np.full(len(routes), -1), p.own[p.leading, SPEED]
+        stops_in = supervisor.way_to_stop(
+            p.supervision, p.assumed, speed, np.zeros(len(routes)), p.scenario.run.step_s, p.step_theta
+        )
+        _, given = orders.step(0.0, start.measure(), start.ways, speed, stops_in, nobody, orders.initial())
         for i, edges in given:
             routes[i] = edges
     return routes

@@ -35,8 +35,8 @@ class View(NamedTuple):
 
 
 def look(
-    ways: Ways, net: along.Net, limit: Floats, factor: Floats, row: Ints, s: Floats, speed: Floats, length: Floats, present: Bools,
-    horizon: float, held: Floats, order: along.Order | None, at: int = SWITCH,
+    ways: Ways, net: along.Net, limit: Floats, falls: Bools, factor: Floats, row: Ints, s: Floats, speed: Floats, length: Floats,
+    present: Bools, horizon: float, held: Floats, order: along.Order | None, at: int = SWITCH,
 ) -> View:  # fmt: skip
     """Look ahead along the ways of all trains.
 
@@ -48,6 +48,8 @@ def look(
         Of the railway, see ``along.net``.
     limit : ndarray, shape (E,)
         Maximum speed on every edge [m/s].
+    falls : ndarray of bool, shape (E,)
+        Where that is about to fall: only half the way there is told, since half the braking is left for it.
     factor : ndarray, shape (n,)
         Share of that which every train keeps to.
     row, s, speed, length, present : ndarray, shape (n,)
@@ -74,7 +76,7 @@ def look(
     far_first = np.argsort(-there.room)
     real = far_first[(there.sense[far_first] != 0) & there.sure[far_first]]
     room[there.train[real]], body[there.train[real]] = there.room[real], there.other[real]  # the nearest is written last
-    limits = Limits(*_limits(ways, limit, factor, row, s, length, present, horizon))
+    limits = Limits(*_limits(ways, limit, falls, factor, row, s, length, present, horizon))
     return View(along.ahead(placed), targets, clear, limits, room, body, fouling(placed))
 
 
@@ -98,7 +100,7 @@ def _targets(body: Bodies, held: Floats, speed: Floats, present: Bools, at: int)
 
 @njit(cache=True)
 def _limits(
-    ways: Ways, limit: Floats, factor: Floats, row: Ints, s: Floats, length: Floats, present: Bools, horizon: float
+    ways: Ways, limit: Floats, falls: Bools, factor: Floats, row: Ints, s: Floats, length: Floats, present: Bools, horizon: float
 ) -> tuple[Ints, Floats, Floats]:
     """Train, distance and speed of the limits under every train and ahead of it within the horizon."""
     count = 0
@@ -114,10 +116,11 @@ def _limits(
                 k -= 1
             last = np.inf
             while k < ways.first[i + 1] and ways.begin[k] - s[i] < horizon:
-                v = factor[i] * limit[ways.edge[k]]
-                if ways.begin[k] <= s[i] or v < last:  # one that is no lower than the one before tells nothing new
+                v, away = factor[i] * limit[ways.edge[k]], ways.begin[k] - s[i]
+                sooner = away > 0.0 and falls[ways.edge[k]]
+                if away <= 0.0 or v < last or sooner:  # one that is no lower than the one before tells nothing new
                     if again:
-                        train[count], distance[count], speed[count] = i, ways.begin[k] - s[i], v
+                        train[count], distance[count], speed[count] = i, 0.5 * away if sooner else away, v
                     count += 1
                 last = v
                 k += 1

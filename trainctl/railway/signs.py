@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trainctl.signals import Floats, Ints
+from trainctl.signals import Bools, Floats, Ints
 
 
 class Signs(NamedTuple):
@@ -36,17 +36,31 @@ def in_force(signs: Signs, base: Floats, t: float) -> Floats:
     return limit
 
 
-def announced(signs: Signs, base: Floats, t: float, step: float, rate: float) -> Floats:
+def announced(signs: Signs, base: Floats, t: float, step: float, rate: float, early: float = 0.0) -> Floats:
     """Limit of every edge for a train that decides at ``t`` [s] on its next ``step`` [s], shape (E,) [m/s].
 
-    A lower limit to come is approached with ``rate`` [m/s2], so that who keeps to it has slowed down when it begins to hold.
+    A lower limit to come is approached with ``rate`` [m/s2] and reached ``early`` [s], so that who keeps to it has slowed down when
+    it begins to hold.
     """
     if not len(signs.time):
         return base
-    limit = np.minimum(in_force(signs, base, t), in_force(signs, base, t + step))
+    limit = _shown(signs, base, t, step)
     later = int(np.searchsorted(signs.time, t + step + 1e-9, side="right"))
-    np.minimum.at(limit, signs.edge[later:], signs.speed[later:] + rate * (signs.time[later:] - t - step))
+    left = np.maximum(signs.time[later:] - t - step - early, 0.0)
+    np.minimum.at(limit, signs.edge[later:], signs.speed[later:] + rate * left)
     return limit
+
+
+def falling(signs: Signs, base: Floats, t: float, step: float, limit: Floats) -> Bools:
+    """Edges (E,) whose ``limit`` is ``announced`` to fall: who comes near needs that rate beside its braking for the place."""
+    if not len(signs.time):
+        return np.zeros(len(base), bool)
+    return limit < _shown(signs, base, t, step)
+
+
+def _shown(signs: Signs, base: Floats, t: float, step: float) -> Floats:
+    """Lowest limit of every edge over the step [m/s], (E,)."""
+    return np.minimum(in_force(signs, base, t), in_force(signs, base, t + step))
 
 
 def highest(signs: Signs, base: Floats) -> Floats:

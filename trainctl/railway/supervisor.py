@@ -154,7 +154,7 @@ class Verdict(NamedTuple):
     emergency: Bools  # full emergency braking is ordered of a moving train
     reason: Ints  # place in KINDS of what binds, -1: nothing does
     target: Ints  # row of what binds, in Limits if the reason is "limit", otherwise in Targets; -1: none
-    strongest: float  # m/s2, -emergency_mps2
+    strongest: float | Floats  # m/s2, -emergency_mps2
 
 
 def as_ordered(rate: float, trains: int) -> Assumed:
@@ -313,6 +313,37 @@ def too_late(
     return found.to_stop < found.way - _LENGTH, np.maximum(enough, 0.0)
 
 
+def way_to_stop(params: Params, assumed: Assumed, speed: Floats, acceleration: Floats, step_s: float, theta: float) -> Floats:
+    """Way [m] in which every train surely stops by braking as planned, or as hard as it surely can if that is less, shape (n,).
+
+    A switch that is nearer must not be turned any more. Where nobody is protected braking counts as planned: nothing is relied on.
+    Arguments are those of ``verdict``.
+    """
+    if params.mode != "on":
+        return stopping_distance(np.maximum(speed, 0.0), params.service_mps2, step_s, theta)
+    late = assumed.lag * np.maximum(acceleration + assumed.braking + assumed.scatter, 0.0)
+    v = np.maximum(speed, 0.0) + assumed.drift + assumed.surge + late
+    return stopping_distance(v, np.minimum(params.service_mps2, assumed.braking), step_s, theta) + assumed.uncertainty
+
+
+def speed_for_limits(assumed: Assumed, speed: Floats, limits: Limits, braking: Floats, step_s: float, theta: float) -> Floats:
+    """Maximum speed [m/s] from which each limit is kept to by braking with ``braking`` (n,) [m/s2], shape (k,).
+
+    For trains that hold their speeds, which are at most ``speed`` (n,) [m/s]. Other arguments are those of ``verdict``.
+    """
+    i = limits.train
+    lowered = np.maximum(limits.speed - assumed.surge[i], 0.0)
+    slower = assumed.drift[i] * (np.maximum(speed[i] - lowered, 0.0) / braking[i] + 2.0 * step_s)
+    room = limits.distance - assumed.uncertainty[i] - settles(assumed, braking)[i] * speed[i] - slower
+    kept = speed_after(room + theta * step_s * lowered, lowered, np.zeros(len(i)), braking[i], step_s, theta)
+    return np.maximum(kept - assumed.lag[i] * assumed.scatter[i], 0.0)
+
+
+def settles(relied: Assumed, planned: Floats) -> Floats:
+    """Time [s] in which the lag of every train's actuators dies away, from braking to a speed error of 5 cm/s; shape (n,)."""
+    return relied.lag * np.log(np.maximum(relied.lag * planned / 0.05, 1.0))
+
+
 def _before_targets(
     params: Params, relied: Assumed, speed: Floats, now: Floats, targets: Targets, step: float, theta: float
 ) -> Floats:
@@ -342,9 +373,7 @@ def _before_limits(
     rate = np.full(len(v), np.inf)
     # Most rows do not bind, and are told cheaply: the limit is not below any speed to come, or farther than any braking for it.
     planned = np.minimum(params.service_mps2, relied.braking)
-    # An actuator's lag dies away: from the braking rate to a speed error of 5 cm/s in so many seconds.
-    late = relied.lag * np.log(np.maximum(relied.lag * planned / 0.05, 1.0))
-    sooner = relied.uncertainty + late * np.maximum(speed, settled)
+    sooner = relied.uncertainty + settles(relied, planned) * np.maximum(speed, settled)
     far = (
         0.5 * top**2 / planned[train] + 4.0 * step * top + sooner[train] + relied.drift[train] * (top / planned[train] + 2.0 * step)
     )

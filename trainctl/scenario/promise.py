@@ -12,6 +12,7 @@ e R         maximum error of the running resistance at the line's own speed [m/s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from trainctl.plants import disturbance, shared
 from trainctl.railway import along, authority, signs, supervisor
 from trainctl.railway.supervisor import Assumed
 from trainctl.railway.ways import ways
-from trainctl.signals import GRAVITY, POSITION, SPEED, Floats
+from trainctl.signals import GRAVITY, POSITION, SPEED, Floats, Ints
 
 if TYPE_CHECKING:
     from trainctl.scenario.model import Model
@@ -208,7 +209,8 @@ def _lost(p: Model) -> list[str]:
     front = laid.begin[row] + p.roster.lane_position
     fastest = float(supervisor.stopping_distance(speed, float(p.assumed.braking.min()), step, p.step_theta).max())
     view = authority.look(
-        laid, along.net(p.rails), p.rails.speed_mps, np.ones(n), row, front, speed, p.consists.train_length(), np.ones(n, bool),
+        laid, along.net(p.rails), p.rails.speed_mps, np.zeros(len(p.rails.speed_mps), bool), np.ones(n), row, front, speed,
+        p.consists.train_length(), np.ones(n, bool),
         fastest + 1000.0, np.full(n, np.inf), None,
     )  # fmt: skip
     found = []
@@ -222,16 +224,34 @@ def _lost(p: Model) -> list[str]:
             f" {enough[k]:.4g} m/s, or supervisor.mode = off"
         )
     limits = view.limits
-    room = np.maximum(limits.distance, 0.0)
-    reached = np.sqrt(np.maximum(speed[limits.train] ** 2 - 2.0 * p.assumed.braking[limits.train] * room, 0.0))
-    for k in np.flatnonzero(reached > limits.speed + 0.1).tolist():
-        i = int(limits.train[k])
-        where = f"in {room[k]:.6g} m" if room[k] > 0.0 else "where it starts"
+    loose = limits._replace(speed=limits.speed + 0.1)
+    holds = p.assumed._replace(surge=np.zeros(n))  # its actuators begin with what holds its speed on the slope
+    kept = supervisor.speed_for_limits(holds, speed, loose, p.assumed.braking, step, p.step_theta)
+    for k in np.flatnonzero(speed[limits.train] > kept).tolist():
+        i, room = int(limits.train[k]), float(limits.distance[k])
+        where = f"in {room:.6g} m" if room > 0.0 else "where it starts"
         found.append(
-            f"train[{p.scenario.ids[i]}].speed_mps = {speed[i]:.10g}: the line allows {limits.speed[k]:.6g} m/s {where}; even"
-            f" full braking leaves {reached[k]:.4g} m/s"
+            f"train[{p.scenario.ids[i]}].speed_mps = {speed[i]:.10g}: the line allows {limits.speed[k]:.6g} m/s {where}; with"
+            f" braking of {p.assumed.braking[i]:.3g} m/s2 at most {max(kept[k] - 0.1, 0.0):.4g} m/s"
         )
     return found
+
+
+def uncovered(p: Model, train: int, edges: Sequence[int] | Ints) -> str:
+    """What of a new way over ``edges`` is not relied on for a train, in words; "": nothing. Orders of the file are counted on."""
+    if p.supervision.mode != "on" or p.placed or p.rerouted:
+        return ""
+    top, (down, up) = top_speed(p)[train], _slopes(p)
+    fastest = float(p.roster.speed_factor[train] * signs.highest(p.signs, p.rails.speed_mps)[edges].max())
+    slope = p.rails.slope[edges]
+    for what, value, most, unit in (
+        ("a limit", fastest, float(top), "m/s"),
+        ("a descent", -1000.0 * float(slope.min()), 1000.0 * float(down[train]), "per mil"),
+        ("an ascent", 1000.0 * float(slope.max()), 1000.0 * float(up[train]), "per mil"),
+    ):
+        if value > most + 1e-9:
+            return f"{what} of {value:.4g} {unit}, where protection relies on {most:.4g} at most; an [[event]] of the file counts"
+    return ""
 
 
 def told(p: Model) -> dict[str, Any]:

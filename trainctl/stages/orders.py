@@ -13,8 +13,8 @@ import numpy as np
 
 from sumo_net.line import LineCrossover
 from trainctl.errors import InputError
-from trainctl.railway import supervisor
 from trainctl.railway.ways import Ways
+from trainctl.scenario import promise
 from trainctl.scenario.events import Event
 from trainctl.scenario.model import Model
 from trainctl.signals import Floats, Ints, Seen
@@ -44,7 +44,6 @@ class Orders:
         self.p, self.journal = p, journal
         self.length = p.consists.train_length()
         self.index = {name: i for i, name in enumerate(p.scenario.ids)}
-        self.theta = p.step_theta
 
     def initial(self) -> State:
         """The orders of the scenario, by time."""
@@ -62,7 +61,7 @@ class Orders:
         return own[number - 1] if number <= len(own) else Event.model_validate(s.given[number - len(own) - 1])
 
     def step(
-        self, t: float, seen: Seen, ways: Ways, speed: Floats, ahead: Ints, s: State
+        self, t: float, seen: Seen, ways: Ways, speed: Floats, stops_in: Floats, ahead: Ints, s: State
     ) -> tuple[State, list[tuple[int, tuple[str, ...]]]]:
         """Orders whose time, place or condition has come: trains and their new routes.
 
@@ -74,8 +73,8 @@ class Orders:
             Where every train is.
         ways : Ways
             Their ways now.
-        speed, ahead : ndarray, shape (n,)
-            Speed [m/s], and the train ahead in the formation, -1 if none.
+        speed, stops_in, ahead : ndarray, shape (n,)
+            Speed [m/s], the way in which it surely stops [m], and the train ahead in the formation, -1 if none.
         s : State
             Orders to come.
 
@@ -94,9 +93,7 @@ class Orders:
             if event.kind != "reroute":
                 continue
             i = self.index[event.train]
-            lock = float(supervisor.stopping_distance(
-                np.maximum(speed[i : i + 1], 0.0), self.p.supervision.service_mps2, self.p.scenario.run.step_s, self.theta
-            )[0])  # fmt: skip
+            lock = float(stops_in[i])
             try:
                 if any(i == other for other, _ in found):
                     raise Refused("it has just been given another route")
@@ -238,6 +235,8 @@ class Orders:
             )
         onward = rails.path(target, int(way[-1]))
         new = [*way[: k - 1].tolist(), *path.tolist(), *([] if onward is None else onward[1:].tolist())]
+        if why := promise.uncovered(self.p, i, new):
+            raise Refused(f"the way to edge {event.to_edge} has {why}")
         common = next((n for n, (a, b) in enumerate(zip(new, way.tolist(), strict=False)) if a != b), min(len(new), len(way)))
         more = {"to_edge": event.to_edge, "from_edge": rails.edges[int(way[max(common - 1, 0)])], "goes_on": onward is not None}
         return tuple(rails.edges[e] for e in new), more

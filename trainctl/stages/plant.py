@@ -223,6 +223,7 @@ class Units:
         assert links is not None
         moved = own.copy()
         moved[:, SPEED] += np.repeat(disturbed.speed, np.diff(first))
+        began = moved.copy()
         limited, estimate, counted = state.extremes.limited.copy(), state.estimate.copy(), state.counted
         demanded = None
         for begin, sub_steps in self._pieces(t):
@@ -240,7 +241,9 @@ class Units:
         assert demanded is not None
         extras = self._extras(t, own, estimate, demanded, loop)
         force = own[:, FORCE].copy() if p.plant.STATES > FORCE else demanded
-        displacement = moved[leading, POSITION] - own[leading, POSITION] + disturbed.position
+        travelled = moved[leading, POSITION] - own[leading, POSITION]
+        asked = self._asked(began, moved, np.maximum(travelled, 0.0), calm)
+        displacement = travelled + disturbed.position
         clipped = displacement < 0.0
         displacement[clipped] = 0.0
         shift = np.repeat(own[leading, POSITION] + displacement - moved[leading, POSITION], np.diff(first))
@@ -248,36 +251,39 @@ class Units:
         mean = (moved[leading, SPEED] - own[leading, SPEED]) / self.step_s
         motion = Motion(
             displacement=displacement, input=np.add.reduceat(force, leading) / self.masses, acceleration=mean,
-            asked=self._asked(own, moved, displacement, mean), limited=state.extremes.limited > limited, clipped=clipped,
+            asked=asked, limited=state.extremes.limited > limited, clipped=clipped,
             force=force, extras=extras,
         )  # fmt: skip
         return Moved(moved, motion, messages, state._replace(heard=air.heard, sent_at=air.sent_at, counted=counted))
 
-    def _asked(self, own: Floats, moved: Floats, displacement: Floats, mean: Floats) -> Floats:
+    def _asked(self, began: Floats, moved: Floats, way: Floats, calm: bool) -> Floats:
         """Acceleration that drives every train over the step [m/s2], (n,); NaN where it stops harder than full braking.
 
-        Where actuators lag it is what they approach; else the mean, or the one that explains the displacement where that is more (a
-        law pulls first and brakes later within the step) or less than full braking (it brakes first).
+        Where actuators lag it is what they approach; else the mean, or the one that explains the ``way`` (n,) where that is more (a
+        law pulls first and brakes later within the step) or less than full braking (it brakes first). ``began`` is the state after
+        the disturbance of the speed; what else disturbs, unless the step is ``calm``, is in it.
         """
         leading, full = self.p.leading, self.p.supervision.emergency_mps2
-        v, after = own[leading, SPEED], moved[leading, SPEED]
-        drives = mean + (self.swing(moved) - self.swing(own)) / self.step_s
+        hardest: float | Floats = full if calm else full + self.p.assumed.scatter
+        v, after = began[leading, SPEED], moved[leading, SPEED]
+        mean = (after - v) / self.step_s
+        drives = mean + (self.swing(moved) - self.swing(began)) / self.step_s
         late = self.p.plant.STATES > FORCE
         if late:
-            before, now = self.acceleration(own), self.acceleration(moved)
+            before, now = self.acceleration(began), self.acceleration(moved)
             drives += self.lag * (np.maximum(now, 0.0) - np.maximum(before, 0.0)) / self.step_s
             # What the supervisor takes for the speed, see its note 4; it changes evenly while an order is held.
             v_late, after_late = (u + self.lag * np.maximum(a + full, 0.0) for u, a in ((v, before), (after, now)))
         else:
             v_late, after_late = v, after
-        beyond = displacement - 0.5 * (v_late + after_late) * self.step_s
+        beyond = way - 0.5 * (v_late + after_late) * self.step_s
         explained = (after_late - v_late) / self.step_s + 2.0 * beyond / self.step_s**2
-        swings = (np.abs(beyond) > WITHIN_M * self.step_s) & ((explained > drives) | (not late) & (explained < -full))
+        swings = (np.abs(beyond) > WITHIN_M * self.step_s) & ((explained > drives) | (not late) & (explained < -hardest))
         # A step that begins and ends at a stand must not creep in between, however little: the next one could do so again.
-        creeps = (v <= 0.0) & (displacement > CREEP_M)
-        stops = np.where(creeps, displacement / self.step_s**2, mean)
+        creeps = (v <= 0.0) & (way > CREEP_M)
+        stops = np.where(creeps, way / self.step_s**2, mean)
         stops = np.where(beyond > WITHIN_M * self.step_s, np.maximum(explained, stops), stops)
-        hard = (v > 0.0) & (displacement < 0.5 * v**2 / full - WITHIN_M * self.step_s)
+        hard = (v > 0.0) & (way < 0.5 * v**2 / hardest - WITHIN_M * self.step_s)
         return np.where(after > 0.0, np.where(swings, explained, drives), np.where(hard, np.nan, stops))
 
     def _climbing(self, own: Floats) -> Floats:

@@ -1,4 +1,9 @@
-"""Protection: the supervisor tries the step without what disturbs it, and bounds what would be too much."""
+"""Protection: the supervisor tries the step without what disturbs it, and bounds what would be too much.
+
+A law that is evaluated within the step may ask for something else once the step is taken: it sees what disturbs its train, and
+that another train does what is ordered, not what it tried. So such a step is looked at again: whoever is beyond its bounds by more
+than what disturbs it may add is bounded too, and the step taken anew; the second time all trains are.
+"""
 
 from __future__ import annotations
 
@@ -26,6 +31,7 @@ class Protect:
     def __init__(self, p: Model, journal: Journal, disturbing: bool) -> None:
         self.p, self.rules, self.journal = p, p.supervision, journal
         self.disturbing = disturbing
+        self.reacts = not p.sampled  # the law is evaluated within the step
 
     def step(
         self, t: float, view: View | None, own: Floats, acceleration: Floats, swing: Floats, driven: Driven, stands: Bools,
@@ -64,12 +70,35 @@ class Protect:
         moved = over_the_step(driven.ordered, calm, plant.copied(state), True)
         within, acts = applied(verdict, moved.motion.asked)
         acts &= ~stands
-        acts_on = self.rules.mode == "on" and bool(acts.any())
-        if acts_on or self.disturbing:
-            ordered = np.where(acts, within, driven.ordered) if acts_on else driven.ordered
-            moved = over_the_step(ordered, disturbed, state, False)
+        on = self.rules.mode == "on"
+        if (on and acts.any()) or self.disturbing:
+            ordered = np.where(acts, within, driven.ordered) if on else driven.ordered
+            if on and self.reacts:
+                moved, acts = self._again(verdict, ordered, driven, stands, acts, disturbed, state, over_the_step)
+            else:
+                moved = over_the_step(ordered, disturbed, state, False)
         self._tell(t, verdict, acts, acting, view, own[self.p.leading, SPEED])
         return moved, acts
+
+    def _again(
+        self, verdict: supervisor.Verdict, ordered: Floats, driven: Driven, stands: Bools, acts: Bools, disturbed: Disturbed,
+        state: plant.State, over_the_step: OverTheStep,
+    ) -> tuple[plant.Moved, Bools]:  # fmt: skip
+        """The step, taken until no train that is left to its law is beyond its bounds; it and the trains (n,) acted on."""
+        scatter, bounded = self.p.assumed.scatter, acts | ~np.isnan(driven.ordered) | stands
+        loose = verdict._replace(
+            maximum=verdict.maximum + scatter, minimum=verdict.minimum - scatter, strongest=verdict.strongest - scatter
+        )
+        again = False
+        while True:
+            moved = over_the_step(ordered, disturbed, plant.copied(state), False)
+            asked = moved.motion.asked
+            beyond = applied(loose, asked + disturbed.speed / self.p.scenario.run.step_s)[1] & ~bounded
+            if not beyond.any():
+                return moved, acts
+            acts, now = acts | beyond, ~bounded if again else beyond
+            ordered, bounded = np.where(now, applied(verdict, asked)[0], ordered), bounded | now
+            again = True
 
     def _verdict(self, view: View, speed: Floats, acceleration: Floats, swing: Floats, error: Floats) -> supervisor.Verdict:
         """What every train may do over the coming step; ``error`` (n,) is that of the measured positions [m]."""

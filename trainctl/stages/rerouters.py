@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from trainctl import draws
-from trainctl.railway import supervisor
 from trainctl.railway.ways import Ways
 from trainctl.scenario.model import Model
 from trainctl.scenario.roster import Stop
@@ -28,7 +27,7 @@ class Rerouters:
         return np.full(len(self.p.scenario.ids), -1)
 
     def step(
-        self, t: float, seen: Seen, ways: Ways, speed: Floats, refused: Ints, busy: Collection[int] = ()
+        self, t: float, seen: Seen, ways: Ways, speed: Floats, stops_in: Floats, refused: Ints, busy: Collection[int] = ()
     ) -> tuple[Ints, list[tuple[int, tuple[str, ...]]]]:
         """Trains on an edge with a rerouter that closes something on their ways now, with their new routes.
 
@@ -40,8 +39,8 @@ class Rerouters:
             Where every train is.
         ways : Ways
             Their ways now.
-        speed : ndarray, shape (n,)
-            [m/s].
+        speed, stops_in : ndarray, shape (n,)
+            Speed [m/s], and the way in which it surely stops [m].
         refused : ndarray, shape (n,)
             Edge on which every train has found no way round already, -1: none.
         busy : collection of int
@@ -59,14 +58,14 @@ class Rerouters:
         now = np.where(seen.present, seen.edge, -1)
         refused, routes = np.where(now == refused, refused, -1), []
         for i in np.flatnonzero((now != refused) & np.isin(now, self.at)).tolist():
-            edges = () if i in busy else self._around(t, i, seen, ways, float(speed[i]))
+            edges = () if i in busy else self._around(t, i, seen, ways, float(speed[i]), float(stops_in[i]))
             if edges is None:
                 refused[i] = now[i]
             elif edges:
                 routes.append((i, edges))
         return refused, routes
 
-    def _around(self, t: float, i: int, seen: Seen, ways: Ways, speed: float) -> tuple[str, ...] | None:
+    def _around(self, t: float, i: int, seen: Seen, ways: Ways, speed: float, stops_in: float) -> tuple[str, ...] | None:
         """The way of train ``i`` round what is closed for it; () if nothing is, None if there is no way."""
         p, rails = self.p, self.p.rails
         train, edge = p.scenario.train[i], rails.edges[int(seen.edge[i])]
@@ -81,10 +80,7 @@ class Rerouters:
         way, begin = ways.edge[row:end].tolist(), ways.begin[row:end]
         if closed.isdisjoint(way[1:]):
             return ()
-        braking = supervisor.stopping_distance(
-            np.array([max(speed, 0.0)]), p.supervision.service_mps2, p.scenario.run.step_s, p.step_theta
-        )  # fmt: skip
-        kept = max(int(np.searchsorted(begin, seen.position[i] + float(braking[0]), side="right")), 1)  # cannot change any more
+        kept = max(int(np.searchsorted(begin, seen.position[i] + stops_in, side="right")), 1)  # cannot change any more
         blocked = next(e for e in way[1:] if e in closed)
         new = None if blocked in way[:kept] else self._path(i, way, kept, closed)
         said: dict[str, Any] = {"closed": rails.edges[blocked], "from_edge": edge}

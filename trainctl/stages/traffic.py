@@ -100,6 +100,7 @@ class Traffic:
         self.pairs = [
             (p.rails.index[order.edge], number[a], number[b]) for order in p.scenario.order for a, b in pairwise(order.trains)
         ]
+        self.settles = float(np.max(supervisor.settles(p.assumed, p.assumed.braking), initial=0.0))
         self.ways: Ways | None = None
         self._limits(0.0)
         routes = [[p.line.index[e] for e in route] for route in p.roster.routes]
@@ -140,7 +141,7 @@ class Traffic:
         if last:
             self._uncalled(s)
         asking, reach = [] if last else [*self._returning(later, s), *self.due(later, s)], self._reach(speed)
-        s, held, entries, kept_out = self.entering(t, ways, s.on_track(seen), speed, s, asking, reach, red)
+        s, held, entries, kept_out = self.entering(t, ways, s.on_track(seen), speed, s, asking, reach, red, self.step_s)
         present = s.on_track(seen).present.copy()
         present[[i for i, _ in entries]] = True
         view = self._look(ways, seen._replace(present=present), speed, held, s, self._reach(speed) if entries else reach)
@@ -190,9 +191,12 @@ class Traffic:
 
     def entering(
         self, t: float, ways: Ways, here: Seen, speed: Floats, s: State, due: Sequence[int], reach: Floats | None = None,
-        red: Held | None = None,
+        red: Held | None = None, after: float = 0.0,
     ) -> tuple[State, Held, tuple[tuple[int, float], ...], dict[int, int]]:  # fmt: skip
-        """Trains of those that are ``due`` whose place is clear, with the speed they come with [m/s]; who keeps out the others."""
+        """Trains of those that are ``due`` whose place is clear, with the speed they come with [m/s]; who keeps out the others.
+
+        They are there ``after`` so many seconds.
+        """
         asking = np.zeros(len(speed), bool)
         asking[due] = True
         stands = (s.kept_out >= 0) & (np.abs(speed[s.kept_out]) < STANDS_MPS)  # who stands may wait for it in turn
@@ -214,7 +218,7 @@ class Traffic:
                 if present[i]:  # and stands for one more step, the one in which it comes back
                     s.parked[i], s.stands_until[i] = False, t + self.step_s
                 continue
-            v = self._entering_speed(i, ways, here, speed, view, held, s)
+            v = self._entering_speed(i, ways, here, speed, view, held, s, after)
             present[i] = v is not None
             if v is None:
                 kept_out[i] = waiting.kept_out(view, i)
@@ -225,7 +229,9 @@ class Traffic:
         keeping[list(kept_out)] = list(kept_out.values())
         return s._replace(came=came, entering=entering, kept_out=keeping), held, tuple(come), kept_out
 
-    def _entering_speed(self, i: int, ways: Ways, here: Seen, speed: Floats, view: View, held: Held, s: State) -> float | None:
+    def _entering_speed(
+        self, i: int, ways: Ways, here: Seen, speed: Floats, view: View, held: Held, s: State, after: float
+    ) -> float | None:
         """Speed with which a train can enter safely; None if it has to wait. ``view`` is that with the train at its place."""
         rules, v, roster = self.rules, self.roster.speed[i], self.roster
         limit = float(roster.speed_factor[i] * self.limit[roster.edge[i]])
@@ -243,6 +249,11 @@ class Traffic:
             planned = float(min(rules.service_mps2, self.assumed.braking[i]))
             left = np.array([min(room, FAR_M) - wanted * self.step_s])
             wanted = min(wanted, float(supervisor.greatest_speed(left, planned, self.step_s, self.theta)[0]))
+        own, fast = view.limits.train == i, np.full(len(speed), wanted)
+        braking = np.minimum(rules.service_mps2, self.assumed.braking)
+        limits = supervisor.Limits(*(column[own] for column in view.limits))
+        kept = supervisor.speed_for_limits(self.assumed, fast, limits, braking, self.step_s, self.theta)
+        wanted = float(min(wanted, *kept.tolist(), np.inf))
         ahead = authority.of(view.targets, (view.targets.train == i) & (view.targets.kind != supervisor.SIGNAL))
         stands = np.where(np.arange(len(speed)) == i, 0.0, speed)
         _, safe = supervisor.too_late(rules, self.assumed, stands, ahead, self.step_s, self.theta)
@@ -252,9 +263,19 @@ class Traffic:
         other = int(view.ahead.train[i])
         if other >= 0 and roster.cooperates[[i, other]].all() and view.ahead.spacing[i] < self.p.spacing.desired - 1.0:
             return None
-        if view.fouling[i] or np.any(view.clear.room[view.clear.other == i] < 0.0):  # another would be under it, or its tail
+        if view.fouling[i] or self._under(i, speed, view, after):
             return None
         return None if self._startles(i, entry, speed, view) else entry
+
+    def _under(self, i: int, speed: Floats, view: View, after: float) -> bool:
+        """Whether another would be under train ``i`` or its tail by the time it comes, ``after`` so many seconds.
+
+        Until then it makes no way, whatever its speed, and whoever follows it may run on.
+        """
+        met = authority.of(view.clear, view.clear.other == i)
+        gains = self.theta * (self.p.supervision.greatest_mps2 + self.assumed.scatter) * after
+        way = (np.maximum(speed, 0.0) + gains + self.assumed.drift) * after
+        return bool(np.any(met.room < np.where(met.kind == supervisor.TRAIN, way[met.train] + self.rules.margin_m, 0.0)))
 
     def _startles(self, i: int, entry: float, speed: Floats, view: View) -> bool:
         """Whether others would have to brake hard for a train that comes with the speed ``entry``."""
@@ -385,7 +406,9 @@ class Traffic:
         """Limit of every edge (E,) [m/s] that is to be kept over the coming step."""
         # A limit that falls while a train comes near asks for more than either alone: half the braking is kept for the way there.
         rate = 0.5 * float(np.min(self.requesting, initial=np.inf))
-        self.limit = signs.announced(self.p.signs, self.p.rails.speed_mps, t, self.step_s, rate)
+        shown, base = self.p.signs, self.p.rails.speed_mps
+        self.limit = signs.announced(shown, base, t, self.step_s, rate, self.settles)
+        self.falls = signs.falling(shown, base, t, self.step_s, self.limit)
 
     def _reach(self, speed: Floats) -> Floats:
         """How far ahead every train requests [m]: farther than it would brake for what it must not enter."""
@@ -440,13 +463,15 @@ class Traffic:
 
     def _look(self, ways: Ways, seen: Seen, speed: Floats, held: Held, s: State, reach: Floats) -> View:
         """What is ahead of every train."""
-        horizon = max(float(np.max(reach, where=seen.present, initial=0.0)) + 1000.0, self.join_range_m)
+        sees = 2.0 if self.falls.any() else 1.0  # half the braking, twice the way
+        horizon = max(sees * float(np.max(reach, where=seen.present, initial=0.0)) + 1000.0, self.join_range_m)
         if self.p.obeys:
             order = aspects.order(ways, self.net.joins, seen.row, seen.position, seen.present, horizon, held.room)
         else:
             order = interlocking.order(s.requests)
         # Trains that SUMO drives may stop as they like: whoever follows one keeps his whole braking distance.
         return authority.look(
-            ways, self.net, self.limit, self.roster.speed_factor, seen.row, seen.position, np.where(self.roster.driven, 0.0, speed),
-            self.length, seen.present, horizon, held.room, order, supervisor.SIGNAL if self.p.obeys else supervisor.SWITCH,
+            ways, self.net, self.limit, self.falls, self.roster.speed_factor, seen.row, seen.position,
+            np.where(self.roster.driven, 0.0, speed), self.length, seen.present, horizon, held.room, order,
+            supervisor.SIGNAL if self.p.obeys else supervisor.SWITCH,
         )  # fmt: skip

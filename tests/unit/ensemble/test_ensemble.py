@@ -27,6 +27,14 @@ CASES = {
     "fully_distributed": ("fully_distributed", DISTURBED),
     "slow_rows": ("fully_distributed", {**DISTURBED, "run.record_every_s": 7.0, "run.control_period_s": 2.0, "run.duration_s": 62}),
     "late": ("fully_distributed", {**DISTURBED, "topology.delay_s": 2.0, "topology.range_m": 9000.0}),
+    "bursts": (
+        "fully_distributed",
+        {
+            **DISTURBED,
+            "channel": {"good_s": 9.0, "bad_s": 3.0, "delay_spread_s": 1.5, "delay_shape": "exponential"},
+        },
+    ),
+    "seldom": ("robust_constrained", {"run.duration_s": 80, "run.seed": 1, "channel": {"send_beyond_m": 5.0, "send_every_s": 8.0}}),
     "outside": (
         "fully_distributed",
         {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from trainctl.railway.signs import announced, highest, in_force, signs
+from trainctl.railway.signs import announced, falling, highest, in_force, signs
 
 BASE = np.array([40.0, 30.0])
 SIGNS = signs([(100.0, "a", 10.0), (200.0, "a", 40.0), (200.0, "b", 50.0), (50.0, "elsewhere", 1.0)], {"a": 0, "b": 1})
@@ -30,3 +30,12 @@ def test_who_keeps_to_what_is_announced_is_never_too_fast():
 
 def test_without_signs_the_net_holds():
     assert announced(signs([], {}), BASE, 0.0, 1.0, 0.5) is BASE
+
+
+def test_an_edge_falls_while_a_lower_limit_is_approached_and_not_after():
+    for t, falls in ((20.0, False), (50.0, True), (99.0, False), (150.0, False)):
+        limit = announced(SIGNS, BASE, t, 1.0, 0.5)
+        assert falling(SIGNS, BASE, t, 1.0, limit).tolist() == [falls, False]
+    early = announced(SIGNS, BASE, 79.0, 1.0, 0.5, 10.0)
+    assert early[0] == 10.0 + 0.5 * 10.0  # as if it came at 90 s
+    assert not falling(signs([], {}), BASE, 0.0, 1.0, BASE).any()

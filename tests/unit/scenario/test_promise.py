@@ -130,10 +130,23 @@ def test_what_cannot_be_kept_is_refused_with_the_number_that_would_do(tmp_path):
     assert late.startswith("s.toml: train[2].speed_mps = 60: 700 m behind train 1 (5 m/s)") and "at most 30.97 m/s" in late
     (fast,) = refused(scenario(tmp_path, speed=71.0, trains=1))
     assert "train[1].speed_mps = 71: the line allows 70 m/s where it starts" in fast
+    assert fast.endswith("with braking of 1 m/s2 at most 70 m/s")
     (stands,) = refused(scenario(tmp_path, plant={"speed_lower_mps": 10.0}))
     assert stands.startswith("s.toml: plant.speed_lower_mps = 10: trains that cannot stand")
     (unit,) = refused(scenario(tmp_path, supervisor={"uncertainty": 3.0}))
     assert "supervisor.uncertainty" in unit and "position_uncertainty_m or speed_uncertainty_mps" in unit
+
+
+def test_a_start_is_judged_in_steps_as_trains_move(tmp_path):
+    """Over 1760 m braking with 1 m/s2 ends at 10 m/s from 60 m/s; in steps of 10 s, with the old speed, from 55.1 m/s."""
+    path = scenario(tmp_path, trains=1, speed=60.0, run={"duration_s": 120.0, "step_s": 10.0})
+    line = {"name": "l", "tracks": ["1"], "length_m": 200000.0, "speed": [[0.0, 70.0], [91760.0, 10.0]]}
+    (tmp_path / "l.toml").write_text(tomli_w.dumps(line))
+    (late,) = refused(path)
+    assert late == ("s.toml: train[1].speed_mps = 60: the line allows 10 m/s in 1760 m; with braking of 1 m/s2 at most 55.1 m/s")
+    done = run(open_scenario(path, {"train": [{"id": 1, "type": "emu", "track": 1, "position_m": 90000.0, "speed_mps": 55.1}]}),
+               tmp_path / "run", "numeric")  # fmt: skip
+    assert json.loads((done.folder / "run.json").read_text())["overspeeds"] == 0
 
 
 def test_a_train_that_does_not_fit_its_plant_is_told_by_that_alone(tmp_path):

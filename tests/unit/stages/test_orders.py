@@ -10,6 +10,7 @@ import pytest
 from staged import started
 
 from trainctl.errors import InputError
+from trainctl.railway import supervisor
 from trainctl.scenario.build import open_scenario
 from trainctl.scenario.events import Event
 from trainctl.stages.orders import Orders, State
@@ -30,7 +31,9 @@ class Asked:
 
     def step(self, pending, t=0.0, speed=80.0, ahead=None, **where):
         seen = self.world.measure()._replace(**where)
-        return self.orders.step(t, seen, self.world.ways, np.full(6, speed), self.alone if ahead is None else ahead, pending)
+        speeds, rules = np.full(6, speed), self.p.supervision
+        stops_in = supervisor.way_to_stop(rules, self.p.assumed, speeds, np.zeros(6), 1.0, self.p.step_theta)
+        return self.orders.step(t, seen, self.world.ways, speeds, stops_in, self.alone if ahead is None else ahead, pending)
 
     def order(self, **more):
         return self.orders.added(Event(kind="reroute", train="1", **more), State((), []))

@@ -162,3 +162,47 @@ def test_a_train_that_stands_where_it_is_held_is_not_acted_on():
     track.stands[2] = True
     track.step(ahead(targets=NEAR))
     assert track.told == [] and not track.acting.any()
+
+
+class Reacting(Track):
+    """Trains under a law that is evaluated within the step: it asks for something else in the step than in the trial."""
+
+    def __init__(self, asks, **more):
+        super().__init__(**more)
+        self.protect.reacts, self.asks = True, asks
+
+    def over_the_step(self, ordered, disturbed, state, calm):
+        moved = super().over_the_step(ordered, disturbed, state, calm)
+        asked = np.where(np.isnan(ordered), self.asks(ordered, disturbed, calm), ordered)
+        return moved._replace(motion=moved.motion._replace(asked=asked))
+
+
+def test_a_law_that_answers_what_disturbs_its_train_is_bounded_all_the_same():
+    track = Reacting(lambda ordered, disturbed, calm: np.full(N, 0.1 if calm else 7.0), disturbing=True)
+    track.disturbed = track.disturbed._replace(speed=np.zeros(N))
+    given = track.step(ahead())
+    np.testing.assert_allclose(given, track.p.supervision.greatest_mps2)
+    assert track.acting.all() and len(track.tried) == 3
+    assert all(state is not track.state for _, _, state, _ in track.tried)  # each was taken from where the train is
+
+
+def test_what_disturbs_a_train_is_not_taken_for_its_law():
+    """The kick counts where it leads beyond what is relied on, not the law's own answer within that."""
+    track = Reacting(lambda ordered, disturbed, calm: np.full(N, 0.1), disturbing=True)
+    track.disturbed = track.disturbed._replace(speed=np.full(N, -0.2))
+    np.testing.assert_allclose(track.step(ahead()), 0.1)
+    assert not track.acting.any() and len(track.tried) == 2
+
+
+def test_a_law_that_answers_what_is_ordered_of_another_train_is_bounded_all_the_same():
+    """Each train pulls once the one ahead is ordered anything: bounds spread, and all are ordered in the end."""
+
+    def asks(ordered, disturbed, calm):
+        return np.where(np.roll(~np.isnan(ordered), 1), 7.0, 0.1)
+
+    track = Reacting(asks)
+    track.disturbed = track.disturbed._replace(speed=np.zeros(N))
+    given = track.step(ahead(targets=NEAR))
+    rules = track.p.supervision
+    assert given[2] == pytest.approx(-rules.emergency_mps2) and given.max() <= rules.greatest_mps2 + 1e-9
+    assert track.acting.tolist() == [False, False, True, True, True, False] and len(track.tried) == 4
