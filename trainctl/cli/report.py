@@ -1,4 +1,4 @@
-"""Commands that show results: ``report``, ``compare``, ``claims``."""
+"""Commands that show results: ``report``, ``film``, ``compare``, ``claims``."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ CAPACITY, SPACING, SUITE = "compare capacity", "compare spacing", "compare suite
 def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
     app.command()(report)
+    app.command()(film)
     app.command()(compare)
     app.command()(claims)
 
@@ -35,6 +36,20 @@ def report(
     from trainctl.runs.run import Run
 
     say(write(Run(folder), out, clock=clock, kmh=kmh))
+
+
+def film(
+    folder: Annotated[Path, typer.Argument(help="Run folder, as `trainctl run` made it.")],
+    out: Annotated[Path | None, typer.Option(help="The file, .gif or .webp; default FOLDER/film.gif.")] = None,
+    seconds: Annotated[float, typer.Option(min=0.2, max=120.0, help="How long the picture lasts.")] = 15.0,
+    from_s: Annotated[float | None, typer.Option(help="Begin at this time of the run in s.")] = None,
+    until_s: Annotated[float | None, typer.Option(help="End at this time of the run in s.")] = None,
+) -> None:
+    """Write the trains on their tracks as a moving picture, for slides: GIF or WebP."""
+    from trainctl.report.film import film as write
+    from trainctl.runs.run import Run
+
+    say(write(Run(folder), out or folder / "film.gif", seconds=seconds, from_s=from_s, until_s=until_s))
 
 
 def compare(
