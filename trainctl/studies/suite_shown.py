@@ -43,8 +43,8 @@ def page(cells: Sequence[Mapping[str, Any]], plan: SuitePlan) -> str:
     return (
         f"<!doctype html><html lang='en'><meta charset='utf-8'><title>trainctl: the suite</title><style>{STYLE}</style>"
         f"<h1>Laws in situations</h1><p>{plan.stops.trains} trains {plan.spacing_m:g} m apart at {kmh:.3g} km/h, {plan.runs}"
-        " runs of each cell. In a cell: runs in which trains touched or one was faster than the line, with the 95 % interval of that"
-        " share; minimum gap; largest error of a spacing at the end and jerk, medians of the runs.</p>"
+        " runs of each cell. In a cell: runs in which trains touched or one was faster than the line, with the 95 % interval of"
+        " that share; minimum gap; largest error of a spacing at the end and jerk, medians of the runs.</p>"
         f"<table><tr><th></th>{head}</tr>{body}</table><h2>Situations</h2><ul>{about}</ul>"
         f"{f'<h2>Refused, or failed</h2><ul>{why}</ul>' if why else ''}</html>\n"
     )
