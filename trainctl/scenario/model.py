@@ -108,7 +108,8 @@ class Model:
         if "emergency_mps2" not in stated.model_fields_set:
             v = self.fastest
             brakes = resistance(v, self.consists.train_davis()) - self.bounds.input_lower
-            ours = self.sure_braking[~self.roster.driven].min(initial=np.inf)
+            own = ~self.roster.driven
+            ours = self.sure_braking[own if own.any() else slice(None)].min()
             wanted = math.ceil(1000.0 * max([stated.emergency_mps2, *brakes[np.isfinite(brakes)]])) / 1000.0
             known["emergency_mps2"] = min(wanted, float(np.floor(1000.0 * ours)) / 1000.0)
             known["service_mps2"] = min(stated.service_mps2, known["emergency_mps2"])

@@ -249,7 +249,8 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
             ways, trips = dict(zip(ids, whole, strict=True)), dict(zip(ids, given.trips, strict=True))
             ordered, wrong = mixed.constraints(scenario.order, ways, trips, rails, traffic.signals)
             given = given._replace(additional=(*given.additional, *ordered))
-            found += wrong
+            bad, notes = mixed.unkept(traffic.source.elements.others, traffic.signals, given.trips)
+            found, told = [*found, *wrong, *bad], [*told, *notes]
         else:
             told += of_signals(traffic.junctions, traffic.source.options, traffic.source.elements.others)
     if found:

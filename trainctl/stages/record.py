@@ -43,7 +43,7 @@ class Journal:
         self.extras = p.plant.COLUMNS
         self.disturbances = DISTURBANCES if p.scenario.disturbance else ()
         self.formed = p.driven
-        self.stops = tuple(dict.fromkeys(stop.name for stops in p.roster.stops for stop in stops)) if p.driven else ()
+        self.stops = tuple(dict.fromkeys(stop.name for stops in p.roster.stops for stop in stops))
         tables = standard_tables(
             p.scenario.ids, p.line.track_ids, p.line.edges, units=self.has_units, watched=watched, stops=self.stops,
             train_extras=(

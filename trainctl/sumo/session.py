@@ -26,6 +26,7 @@ from trainctl.sumo.commanded_files import LOGS, arrival_word, normal, write_conf
 from trainctl.sumo.idling import OF_IDLING, idle_s, silent
 from trainctl.sumo.preflight import objections
 from trainctl.sumo.signal_box import Box, Obeyed
+from trainctl.traffic.trial import tried_as_a_whole
 
 #: What SUMO adds in one step is exact to rounding; anything beyond was somebody else.
 TOLERANCE_M = 1e-6
@@ -179,6 +180,8 @@ class Sumo(Session):
         self.coming: list[tuple[int, float]] = []
         self.pending: dict[int, float] = {}
         self.returning: list[int] = []
+        if self.obeyed is not None:  # SUMO is handed parts of the user's files
+            tried_as_a_whole(configuration, self.since, "network.sumocfg")
         self._begin(configuration)
         row = self.ways.first[:-1].copy()
         everyone = np.flatnonzero(start.present)
