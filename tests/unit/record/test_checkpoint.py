@@ -269,7 +269,7 @@ def test_a_stage_that_keeps_something_to_itself_is_found_out():
     p = open_scenario("three_tracks")
     loop = Loop(p, Numeric(p.line), Unheard())
     made = beside(loop)
-    assert {"control.clamps", "orders.theta", "record.track_of", "protect.disturbing"} <= made.keys()
+    assert {"control.clamps", "orders.length", "record.track_of", "protect.disturbing"} <= made.keys()
     for stage, thing in (("control", 3), ("driver", [1.0]), ("protect", {"x": np.zeros(2)}), ("record", None)):
         getattr(loop, stage).hidden = thing
         assert any(place.startswith(f"{stage}.hidden") for place in lost(made, beside(loop))), stage
