@@ -18,6 +18,8 @@ finite_time        numeric: ``emu_finite_time`` on the same trains
 actuated_units     numeric: ``fault_tolerant`` with its observer on trains of four units with actuators
 supervised         numeric: the loop under the supervisor
 traffic            numeric: trains that come from two lines each, form up where these merge, and are supervised
+ignoring           in SUMO: trains on the same lines, with a signal every 2 km, that nobody obeys
+obeying            the same trains obey the signals; less ``ignoring``, it is what obeying costs
 =================  ===============================================================================================================
 
 The net is fixed: three parallel tracks cut into edges of 5 km, ``bench_three_tracks``, as long as the trains need. The outputs of
@@ -60,9 +62,12 @@ SIZES = (10, 100, 1000, 10_000)
 IN_SUMO = ("bare", "idle", "rail", "loop", "sparse", "traci", "client")
 ALONE = ("bare", "idle", "rail", "client")  # without our loop
 NUMERIC = ("coupled_units", "finite_time", "actuated_units", "supervised", "traffic")
-OURS = ("loop", "sparse", *NUMERIC)  # compared between checkouts
+SIGNALLED = ("ignoring", "obeying")
+COMING = ("traffic", *SIGNALLED)  # trains of a SUMO configuration
+OURS = ("loop", "sparse", *NUMERIC, *SIGNALLED)  # compared between checkouts
+EVERY = (*IN_SUMO, *NUMERIC, *SIGNALLED)
 #: Compared to a few per cent; through TraCI everything is many times slower, which one repeat tells.
-REPEATED = ("bare", "idle", "rail", "loop", "sparse")
+REPEATED = ("bare", "idle", "rail", "loop", "sparse", *SIGNALLED)
 PARTS = ("read", "topology", "control", "plant", "write", "step", "record")
 EDGE_M = 5000.0
 SPEED_MPS = 80.0
@@ -71,12 +76,12 @@ SPACING_M = dict.fromkeys((*IN_SUMO, *NUMERIC), 500.0) | {"finite_time": 900.0, 
 #: Train-steps of one repeat, about; the slower a case, the fewer.
 WORK = {
     "traci": 15_000, "client": 10_000, "coupled_units": 30_000, "finite_time": 20_000, "actuated_units": 9_000,
-    "supervised": 60_000, "traffic": 60_000,
+    "supervised": 60_000, "traffic": 60_000, "ignoring": 60_000, "obeying": 60_000,
 }  # fmt: skip
 IN_SUMO_WORK = 120_000
 
 #: Steps before those that are measured: until then all trains have come.
-BEFORE = {"traffic": 160}
+BEFORE = {"traffic": 160, "ignoring": 800, "obeying": 800}
 
 #: Steps of the two runs whose instructions are compared; in between, the recorder writes at 1000 trains what 66 steps hold.
 COUNTED = (10, 76)
@@ -97,8 +102,10 @@ def steps_of(case: str, trains: int) -> int:
 
 def scenario(case: str, trains: int, steps: int) -> tuple[str, str]:
     """TOML of the scenario and of its line: trains take turns on the tracks, a little off their slots."""
-    if case == "traffic":
-        return f"{_TRAFFIC}[run]\nduration_s = {steps}\nstep_s = 1.0\ncontrol_period_s = 8.0\n", ""
+    if case in COMING:
+        alone = '[traffic]\ncooperate = []\nsignals = "{}"\n'.format("obey" if case == "obeying" else "ignore")
+        run = f"[run]\nduration_s = {steps}\nstep_s = 1.0\ncontrol_period_s = 8.0\n"
+        return f"{_TRAFFIC}{run}{alone if case in SIGNALLED else ''}", ""
     spacing, rows = SPACING_M[case], -(-trains // 3)
     slots = case in ("finite_time", "actuated_units")  # these laws want one slot per train, whatever its track
     front = 1000.0 + (trains if slots else rows) * spacing
@@ -125,21 +132,34 @@ def scenario(case: str, trains: int, steps: int) -> tuple[str, str]:
 PER_PIECE, BRANCH_M, TRUNK_M = 8, 6000.0, 40_000.0
 
 
-def railway(folder: Path, trains: int) -> None:
+#: ... and distance of its signals, where it has some; trains then come farther apart.
+BLOCK_M, APART_S = 2000.0, 220.0
+
+
+def railway(folder: Path, trains: int, signals: bool = False) -> None:
     """Pieces of railway beside each other: in each two branches merge; trains come far enough apart to enter at once."""
     from sumo_net.build import program
 
     nodes, edges, came = [], [], []
     for k in range(-(-trains // PER_PIECE)):
         y = 4000.0 * k
-        places = {"w": (0.0, y), "s": (0.0, y - 1500.0), "m": (BRANCH_M, y), "e": (BRANCH_M + TRUNK_M, y)}
-        nodes += [f'<node id="{name}{k}" x="{x}" y="{at}"/>' for name, (x, at) in places.items()]
-        for name, begin, end in (("west", "w", "m"), ("south", "s", "m"), ("trunk", "m", "e")):
+        blocks = round(TRUNK_M / BLOCK_M) if signals else 1
+        trunk = [f"t{b}." for b in range(blocks)]
+        places = {"w": (0.0, y), "s": (0.0, y - 1500.0), "e": (BRANCH_M + TRUNK_M, y)}
+        places |= {name: (BRANCH_M + b * TRUNK_M / blocks, y) for b, name in enumerate(trunk)}
+        for name, (x, at) in places.items():
+            kind = ' type="rail_signal"' if signals and name in trunk else ""
+            nodes.append(f'<node id="{name}{k}" x="{x}" y="{at}"{kind}/>')
+        ways = [("west", "w", trunk[0]), ("south", "s", trunk[0])]
+        ways += [(f"trunk-{a}", a, b) for a, b in zip(trunk, [*trunk[1:], "e"], strict=True)]
+        for name, begin, end in ways:
             edges.append(f'<edge id="{name}{k}" from="{begin}{k}" to="{end}{k}" numLanes="1" speed="40" allow="rail"/>')
+    apart = APART_S if signals else 40.0
     for i in range(trains):
         k, turn = divmod(i, PER_PIECE)
-        branch, depart = ("west", "south")[turn % 2], 40.0 * (turn // 2) + 20.0 * (turn % 2)
-        came.append((depart, i, f'<route edges="{branch}{k} trunk{k}"/>'))
+        branch, depart = ("west", "south")[turn % 2], apart * (turn // 2) + 0.5 * apart * (turn % 2)
+        way = " ".join([f"{branch}{k}", *(f"trunk-{name}{k}" for name in trunk)])
+        came.append((depart, i, f'<route edges="{way}"/>'))
     body = "".join(f'<vehicle id="{i}" type="emu" depart="{t}" departSpeed="max">{way}</vehicle>' for t, i, way in sorted(came))
     kind = '<vType id="emu" vClass="rail" length="100" maxSpeed="45"/>'
     (folder / "a.nod.xml").write_text(f"<nodes>{''.join(nodes)}</nodes>", encoding="utf-8")
@@ -428,7 +448,7 @@ def closed(folder: Path, case: str) -> Case:
     model = open_scenario(str(folder / "scenario.toml"))
     clock = Clock()
     journal = Journal(folder, model)
-    world: Any = open_world(model, folder, "sumo" if case in IN_SUMO else "numeric")
+    world: Any = open_world(model, folder, "sumo" if case in (*IN_SUMO, *SIGNALLED) else "numeric")
     loop = Loop(model, world, journal)
     loop.step()  # compiles or loads what the kernels need
     clock.around(loop, "_measured", "read")
@@ -440,7 +460,7 @@ def closed(folder: Path, case: str) -> Case:
     clock.around(world, "move", "write")
     clock.around(world, "close", "step")
     clock.around(journal, "close", "record")
-    if case in IN_SUMO:
+    if case in (*IN_SUMO, *SIGNALLED):
         import libsumo
 
         clock.around(world, "_read", "read")
@@ -458,7 +478,7 @@ def public(folder: Path, case: str) -> Case:
     import trainctl
 
     simulation = trainctl.Simulation.open(
-        folder / "scenario.toml", backend="sumo" if case in IN_SUMO else "numeric", out=folder / "run", force=True
+        folder / "scenario.toml", backend="sumo" if case in (*IN_SUMO, *SIGNALLED) else "numeric", out=folder / "run", force=True
     )
     simulation.step()  # compiles or loads what the kernels need
     return Case(len(simulation.trains), simulation.step, lambda: None, Clock())
@@ -539,8 +559,8 @@ def place(root: Path, case: str, trains: int) -> Path:
         text, line = scenario(case, trains, steps + 2 + BEFORE.get(case, 0))
         (folder / "scenario.toml").write_text(text, encoding="utf-8")
         (folder / "line.toml").write_text(line, encoding="utf-8")
-        if case == "traffic":
-            railway(folder, trains)
+        if case in COMING:
+            railway(folder, trains, case in SIGNALLED)
         if case in ALONE:
             process = python("--inputs", case, str(folder), str(trains), str(steps))
             process.communicate()
@@ -710,11 +730,14 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description="What closing the loop costs beside SUMO alone.")
     parser.add_argument("--trains", type=int, action="append", help="number of trains; repeatable; default 10, 100, 1000, 10000")
-    parser.add_argument("--only", action="append", choices=[*IN_SUMO, *NUMERIC], help="this case; repeatable; default all")
+    parser.add_argument(
+        "--only", action="append", choices=[*IN_SUMO, *NUMERIC, *SIGNALLED], help="this case; repeatable; default all"
+    )
     parser.add_argument("--repeats", type=int, help="repeats of each case, default 3; of pairs, default 10; the median is told")
     parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="compare with the code there; default 1000 trains")
     parser.add_argument("--instructions", action="store_true", help="count instructions with valgrind: repeatable, but slow")
     parser.add_argument("--logs", type=float, nargs="?", const=40.0, metavar="MB", help="how fast logs of this size are read")
+    parser.add_argument("--ensembles", type=int, nargs="?", const=1000, metavar="RUNS", help="how fast runs side by side are")
     parser.add_argument("--json", action="store_true", help="print a list of rows for machines")
     parser.add_argument("--case", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--public", nargs=3, help=argparse.SUPPRESS)
@@ -730,6 +753,11 @@ def main() -> None:
         case, folder, checkout = asked.public
         of_this(Path(checkout))
         child(case, Path(folder), public)
+    elif asked.ensembles is not None:
+        import bench_ensembles
+
+        rows = bench_ensembles.ensembles(asked.ensembles, asked.repeats or 3)
+        print(json.dumps(rows, indent=2) if asked.json else bench_ensembles.table(rows))
     elif asked.logs is not None:
         import bench_logs
 
@@ -749,7 +777,7 @@ def main() -> None:
             elif asked.instructions:
                 rows = counted(Path(root), asked.trains or [1000], cases or ["bare", "rail", "loop"])
             else:
-                rows = bench(Path(root), sizes, cases or [*IN_SUMO, *NUMERIC], asked.repeats or 3)
+                rows = bench(Path(root), sizes, cases or list(EVERY), asked.repeats or 3)
         print(json.dumps(rows, indent=2) if asked.json else table(rows))
 
 

@@ -86,8 +86,10 @@ def ours() -> dict[str, list[tuple[str, str, str]]]:
     out: dict[str, list[tuple[str, str, str]]] = {}
     with tempfile.TemporaryDirectory() as scratch:
         done = run(open_scenario("three_tracks", {"run.duration_s": 8}), Path(scratch) / "run", "numeric")
-        for table in ("trains", "units", "links"):
-            for field in pq.read_schema(done.folder / f"{table}.parquet"):
+        stops = run(open_scenario("merging", {"run.duration_s": 240}), Path(scratch) / "stops", "numeric")
+        tables = {name: done.folder / f"{name}.parquet" for name in ("trains", "units", "links")}
+        for table, file in (tables | {"calls": stops.folder / "stops.parquet"}).items():
+            for field in pq.read_schema(file):
                 unit = next((u for end, u in sorted(ENDINGS.items(), key=lambda e: -len(e[0])) if field.name.endswith(end)), None)
                 number = pa.types.is_floating(field.type) or pa.types.is_integer(field.type)
                 kind = "number" if number else "true or false" if pa.types.is_boolean(field.type) else "text"
@@ -167,6 +169,7 @@ def tables() -> str:
     out = []
     for table, columns in found.items():
         where = "a run folder's" if table in ("trains", "units", "links", "events") else "SUMO's"
+        where = "stops.parquet of a run folder; `stops` is a log of SUMO's" if table == "calls" else where
         out += [f"\n**{table}** ({where})\n", "| column | unit | type |", "| --- | --- | --- |"]
         out += [f"| `{column}` | {unit} | {kind} |" for column, unit, kind in columns]
     return "\n".join(out).strip() + "\n"

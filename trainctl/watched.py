@@ -12,8 +12,10 @@ import numpy as np
 
 from trainctl.railway import supervisor
 from trainctl.railway.ways import Ways
+from trainctl.record.columns import Call
 from trainctl.scenario.model import Model
-from trainctl.signals import POWERS, Bools, Extremes, Floats, Ints, Links, Motion, Observed, Row
+from trainctl.scenario.roster import Stop
+from trainctl.signals import POWERS, Bools, Extremes, Floats, Ints, Links, Motion, Observed, Row, Seen
 from trainctl.stages import orders, record
 from trainctl.stages.effort import Effort
 from trainctl.steps import Steps
@@ -28,6 +30,8 @@ class State(NamedTuple):
     entered: Bools  # (n,)
     edge: Ints  # (n,) where every train was last told of, -1: not on the net
     stops: tuple[str, ...]  # at which each train stands, "" if at none
+    next_stop: Ints  # (n,) number of it in the roster
+    since: Floats  # (n,) s, when each train came to stand there; NaN: it does not
     energy: Floats  # (n, 6) J since the last row, as ``POWERS``
     watch: record.State
 
@@ -58,6 +62,7 @@ class Watched(Steps):
         n = len(p.scenario.ids)
         self.state = State(
             k=0, orders=self.orders.initial(), entered=np.zeros(n, bool), edge=np.full(n, -1), stops=("",) * n,
+            next_stop=np.zeros(n, np.int64), since=np.full(n, np.nan),
             energy=np.zeros((n, len(POWERS))),
             watch=self.record.initial(),
         )  # fmt: skip
@@ -90,6 +95,9 @@ class Watched(Steps):
         now, t = self.world.measure(), self.time
         self.state = s = self._told(t, now, self.state)
         self._record(t, self.world.ways, now, None, True, s)
+        for i, stops in enumerate(self.p.roster.stops):
+            for k, stop in enumerate(stops[int(s.next_stop[i]) :], int(s.next_stop[i])):
+                self._call(i, stop, k, float(s.since[i]) if k == s.next_stop[i] else np.nan, np.nan)
         missing = [self.p.scenario.ids[i] for i in np.flatnonzero(~s.entered)]
         self.not_entered = len(missing)
         if missing:
@@ -120,7 +128,31 @@ class Watched(Steps):
                 self.journal.event(t, "stop_left", train=ids[i], stop=was)
             if now_at and was != now_at:
                 self.journal.event(t, "stop_reached", train=ids[i], stop=now_at)
+        s = self._calls(t, seen, s)
         return s._replace(entered=s.entered | seen.present, edge=edge, stops=self.world.stops)
+
+    def _calls(self, t: float, seen: Seen, s: State) -> State:
+        """Record the stops that trains leave, and the waypoints that they pass."""
+        next_stop, since = s.next_stop.copy(), s.since.copy()
+        for i, (stops, was, now_at) in enumerate(zip(self.p.roster.stops, s.stops, self.world.stops, strict=True)):
+            left = stops[int(next_stop[i]) :]
+            if not left or not (seen.present[i] or was):
+                continue
+            for stop in left:
+                if stop.passing and (seen.present[i] and seen.position[i] >= stop.place):
+                    self._call(i, stop, int(next_stop[i]), t, t)
+                elif not stop.passing and was and was != now_at:
+                    self._call(i, stop, int(next_stop[i]), float(since[i]), t)
+                    since[i], was = np.nan, ""
+                else:
+                    break
+                next_stop[i] += 1
+            if now_at and np.isnan(since[i]):
+                since[i] = t
+        return s._replace(next_stop=next_stop, since=since)
+
+    def _call(self, i: int, stop: Stop, number: int, arrival: float, departure: float) -> None:
+        self.journal.call(i, Call(stop, number + 1, arrival, departure), self.p.rails.index[stop.edge])
 
     def _record(self, t: float, ways: Ways, now: Observed, motion: Motion | None, due: bool, s: State) -> None:
         """One instant: alarms, then its row, if one is ``due``; ``motion`` is what followed."""

@@ -290,9 +290,9 @@ def test_what_was_recorded_stays_if_the_run_does_not_end(
     step = Baseline.step
 
     def trouble(self: Baseline) -> None:
-        if self._time() == 30.0 and how == "interrupted":
+        if self.now() == 30.0 and how == "interrupted":
             os.kill(os.getpid(), signal.SIGTERM)
-        elif self._time() == 30.0:
+        elif self.now() == 30.0:
             raise SimulatorError("it broke")
         step(self)
 

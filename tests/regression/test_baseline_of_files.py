@@ -76,6 +76,13 @@ def test_every_train_arrives_when_it_does_in_plain_sumo(folder, case):
     assert [e["what"] for e in found.events if e["kind"] == "not_followed"] == [
         "options time-to-teleport and collision.action: trains are never teleported, none is removed that collides"
     ]
+    theirs = {(row["id"], float(row["started"]), float(row["ended"])) for row in plain(folder, "stop")}
+    table = found.stops
+    made = {(str(r.train), r.arrival_s + since, r.departure_s + since) for r in table.itertuples()}
+    assert len(made) == len(theirs)
+    if case != "waypoint":  # SUMO tells when the train was at its slowest there
+        for (name, *ours), (other, *times) in zip(sorted(made), sorted(theirs), strict=True):
+            assert name == other and ours == pytest.approx(times, abs=1.0)
 
 
 def test_what_moving_block_changes_is_named(folder):

@@ -259,16 +259,30 @@ def test_a_run_with_signals_resumes_to_the_byte(tmp_path, others):
         ("", {"signals": "obey"}, ["no rail signal stands before edge main for train a and 1 more", "the net has no rail signals"]),
         ("", {"others": "sumo"}, ["traffic.others = sumo: no rail signal stands before edge main for train a and 1 more"]),
         ("wx", {"others": "sumo"}, ["no rail signal stands before edge main for train b"]),
+        ("wsmx", {"signals": "obey", "constraint": "q"}, ["railSignalConstraints q: no such rail signal"]),
         ("wsmx", {"others": "sumo", "signals": "ignore"}, ['traffic.signals = ignore: not with others = "sumo"']),
     ],
 )
 def test_what_signals_cannot_decide_is_refused(tmp_path, typed, signals, driving, told):
     join(tmp_path / "n", nets.train("a", WEST, 0) + nets.train("b", SOUTH, 60), signals)
-    made = nets.scenario("robust_constrained", 500, traffic={"cooperate": ["a"], **driving})
+    if "constraint" in driving:
+        also(tmp_path / "n", constraint(driving["constraint"], "predecessor", "a", "m", "b"))
+    keys = {key: value for key, value in driving.items() if key != "constraint"}
+    made = nets.scenario("robust_constrained", 500, traffic={"cooperate": ["a"], **keys})
     (tmp_path / "n" / "s.toml").write_text(tomli_w.dumps(made))
     code, lines = typed("check", tmp_path / "n" / "s.toml")[:2]
     assert code == 2
     assert len(lines) == len(told) and all(part in line for part, line in zip(told, lines, strict=True)), lines
+
+
+def test_what_sumo_would_die_of_is_refused_in_its_words(tmp_path, typed):
+    """SUMO ends the process that loads such a file."""
+    join(tmp_path / "n", nets.train("a", WEST, 0) + nets.train("b", SOUTH, 60, arrivalSpeed="fast"))
+    made = nets.scenario("robust_constrained", 100, traffic={"cooperate": ["a"], "others": "sumo"})
+    (tmp_path / "n" / "s.toml").write_text(tomli_w.dumps(made))
+    code, lines = typed("run", tmp_path / "n" / "s.toml", "--out", tmp_path / "out")
+    assert code == 2 and lines and lines[0].startswith("network.sumocfg: SUMO refuses it: "), lines
+    assert not (tmp_path / "out").exists() and not (tmp_path / "out.partial").exists()
 
 
 def test_signals_are_for_sumo_alone(tmp_path, typed):

@@ -100,6 +100,8 @@ def _of_run(source: Run, place: Path, every_s: float, units_every_s: float) -> N
     for table, every in steps.items():
         for path in source.files(table):
             _write(_kept(path, "time_s", every), place / f"{table}.parquet")
+    for path in source.files("stops"):
+        (place / path.name).write_bytes(path.read_bytes())
     for kind, path in sumo_logs_in(source.folder / "sumo").items():
         if kind == "fcd" and path.suffix == ".parquet":
             _write(_kept(path, "timestep_time", every_s), place / "sumo" / "fcd.parquet")

@@ -239,7 +239,7 @@ def _runs(report: Report, a: Run, b: Run, tolerances: Tolerances, names: dict[st
         if a.info.get(key) != b.info.get(key):
             report.settings.append((key, a.info.get(key), b.info.get(key)))
     _scenarios(report, a.scenario, b.scenario)
-    for table in ("trains", "units", "links"):
+    for table in ("trains", "units", "links", "stops"):
         if a.files(table) and b.files(table):
             report.tables.append(compare(our_table(a, table), our_table(b, table), tolerances, names, table in kept))
         elif a.files(table) or (b.files(table) and not kept):

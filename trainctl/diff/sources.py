@@ -19,8 +19,9 @@ __all__ = ["KINDS", "NAMES", "Log", "our_events", "our_table", "sumo_log", "sumo
 
 
 def our_table(run: Run, table: str) -> Log:
-    """A table of a run folder as a stream."""
-    keys = {"trains": ("train",), "units": ("train", "unit"), "links": ("sender", "receiver")}[table]
+    """A table of a run folder as a stream; its stops are called calls, since a log of SUMO's has that name."""
+    keys = {"trains": ("train",), "units": ("train", "unit"), "links": ("sender", "receiver"), "stops": ("train", "number")}[table]
+    time = None if table == "stops" else "time_s"
 
     def batches() -> Iterator[pa.Table]:
         for path in run.files(table):
@@ -28,12 +29,12 @@ def our_table(run: Run, table: str) -> Log:
             if len(set(names)) < len(names):
                 raise InputError(f"{path}: a column stands more than once")
             for batch in (rows.rename_columns(names) for rows in parquet_rows(path)):
-                for name in ("time_s", *keys):
+                for name in (*([time] if time else []), *keys):
                     if name not in batch.column_names:
                         raise InputError(f"{path}: has no column {name}")
                 yield batch
 
-    return Log(table, str(run.folder / f"{table}.parquet"), "time_s", keys, batches)
+    return Log("calls" if table == "stops" else table, str(run.folder / f"{table}.parquet"), time, keys, batches)
 
 
 def our_events(run: Run, renamed: Mapping[str, str]) -> Log:

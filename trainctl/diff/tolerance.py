@@ -81,7 +81,7 @@ MOST_OF_THE_CLOCK = 0.5
 NO_TIME = Tolerance(0.0)
 
 #: Names that may stand before a column.
-TABLES = ("trains", "units", "links", "events", *(kind.name for kind in KINDS))
+TABLES = ("trains", "units", "links", "calls", "events", *(kind.name for kind in KINDS))
 
 
 @dataclass(frozen=True)

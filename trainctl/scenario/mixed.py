@@ -134,6 +134,23 @@ def constraints(
     return found, wrong
 
 
+def unkept(elements: Sequence[Element], signals: Sequence[Signal], trips: Collection[str]) -> tuple[list[str], list[str]]:
+    """Constraints of the user's files at signals that are not there, which SUMO refuses; and of trains that do not come.
+
+    ``trips`` is what constraints call the trains. Returns mistakes and notes, one line each.
+    """
+    names, wrong, notes = {one.name for one in signals}, [], []
+    for given in (e for e in elements if e.tag == "railSignalConstraints"):
+        who = f"railSignalConstraints {given.get('id', '')}"
+        wrong += [f"{who}: no such rail signal"] if given.get("id", "") not in names else []
+        for one in given:
+            wrong += [f"{who}: {one.tag}: tl = {one.get('tl')}: no such rail signal"] if one.get("tl", "") not in names else []
+            foes = [foe for foe in one.get("foes", "").split() if foe not in trips]
+            if foes and one.get("tripId") in trips:
+                notes.append(f"{who}: {one.tag}: {', '.join(foes)}: no such train: {one.get('tripId')} waits for it for ever")
+    return wrong, notes
+
+
 def _before(route: Sequence[str], edges: Collection[str], rails: Rails, at: Mapping[tuple[str, str], str]) -> str | None:
     """The last signal on a route before the first of these edges, None if there is none."""
     normal = [e for e in route[: next(k for k, e in enumerate(route) if e in edges) + 1] if not rails.internal[rails.index[e]]]

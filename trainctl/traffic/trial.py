@@ -1,4 +1,4 @@
-"""Nets tried by the ``sumo`` program where it is in doubt whether SUMO takes them: some kill the process that loads them."""
+"""What is in doubt is tried by the ``sumo`` program: nets and files that SUMO refuses may kill the process that loads them."""
 
 from __future__ import annotations
 
@@ -34,12 +34,21 @@ def tried(net: Path) -> None:
     InputError
         SUMO refuses it, in its words.
     """
+    _loaded(str(net), "-n", str(net), "--end", "0")
+
+
+def tried_as_a_whole(configuration: Path, begin_s: float, called: str) -> None:
+    """The same of a configuration with all its trains, which is ``called`` so where SUMO refuses it."""
+    _loaded(called, "-c", str(configuration), "--end", f"{begin_s:.3f}", "--route-steps", "0")
+
+
+def _loaded(called: str, *options: str) -> None:
     sumo, environment = program("sumo")
     try:
-        command = [str(sumo), "-n", str(net), "--end", "0", "--no-step-log"]
+        command = [str(sumo), *options, "--no-step-log"]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
     except subprocess.TimeoutExpired:
-        raise InputError(f"{net}: SUMO does not load it within {PATIENCE_S:g} s") from None
+        raise InputError(f"{called}: SUMO does not load it within {PATIENCE_S:g} s") from None
     if done.returncode != 0:
         said = [line.removeprefix("Error: ") for line in done.stderr.splitlines() if line.startswith("Error: ")]
-        raise InputError([f"{net}: SUMO refuses it: {line}" for line in said[:5]] or [f"{net}: SUMO dies of it"])
+        raise InputError([f"{called}: SUMO refuses it: {line}" for line in said[:5]] or [f"{called}: SUMO dies of it"])

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import nets
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pc_csv
@@ -16,6 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 import tomli_w
 
+from trainctl.diff.golden import make_golden
 from trainctl.diff.rows import compare
 from trainctl.diff.runs import EXACT, Tolerance, Tolerances, diff, parse_tolerances, read_tolerances
 from trainctl.diff.sources import Log
@@ -70,6 +72,27 @@ def test_one_altered_row_is_located(run, copy):
     assert column.largest.difference == pytest.approx(2e-3)
     assert report.first.startswith("trains: 17 s, train 3: input_mps2 ")
     assert diff(run, copy, Tolerances(Tolerance(3e-3))).same
+
+
+def test_a_delay_at_a_stop_is_located(tmp_path):
+    from trainctl.runner import run as again
+    from trainctl.scenario.build import open_scenario
+
+    nets.station(tmp_path)
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(nets.scenario("robust_constrained", 400)))
+    one = again(open_scenario(str(tmp_path / "s.toml")), tmp_path / "one", "numeric").folder
+    copy = Path(shutil.copytree(one, tmp_path / "copy"))
+    assert diff(one, copy, EXACT).same
+    changed(copy / "stops.parquet", lambda frame: frame.__setitem__("arrival_s", frame.arrival_s + 2.0))
+    report = diff(one, copy)
+    (table,) = [t for t in report.tables if not t.same]
+    (column,) = table.columns.values()
+    assert (table.table, column.column, column.differing) == ("calls", "arrival_s", 1)  # the other one has not come
+    assert report.first is not None and report.first.startswith("calls: train stops, number 1: arrival_s ")
+    assert diff(make_golden(one, tmp_path / "golden"), one).same
+    assert not diff(make_golden(one, tmp_path / "kept"), copy).same
+    (copy / "stops.parquet").unlink()
+    assert diff(one, copy).files == ["stops: only in A"]
 
 
 def test_a_changed_seed_is_located(finished, run):

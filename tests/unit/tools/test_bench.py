@@ -41,6 +41,21 @@ def test_trains_of_the_traffic_case_come_merge_and_couple(tmp_path):
     assert any((a - b) % 2 for a, b in pairs) and all(a // bench.PER_PIECE == b // bench.PER_PIECE for a, b in pairs)
 
 
+def test_the_trains_of_the_signalled_cases_are_there_and_obey_or_not(tmp_path):
+    """The same trains on the same tracks; nobody stands while time is taken."""
+    for case in bench.SIGNALLED:
+        folder = tmp_path / case
+        folder.mkdir()
+        (folder / "scenario.toml").write_text(bench.scenario(case, 8, 820)[0])
+        bench.railway(folder, 8, signals=True)
+        run = trainctl.run(folder / "scenario.toml", backend="sumo", out=folder / "run")
+        came = {e["train"]: e["time_s"] for e in run.events if e["kind"] == "depart"}
+        assert len(came) == 8 and max(came.values()) <= bench.BEFORE[case]
+        assert not [e for e in run.events if e["kind"] in ("signal", "red_passed", "violation")]
+        said = [e["what"] for e in run.events if e["kind"] == "not_followed"]
+        assert any("rail signals: not obeyed" in what for what in said) is (case == "ignoring")
+
+
 def test_ratios_are_those_within_a_pair():
     def result(seconds):
         return {"steps": 10, "seconds": seconds, "cpu": 2.0 * seconds}
