@@ -61,7 +61,10 @@ def overlay(drawn: Sequence[Drawn], names: Sequence[str], what: str) -> Figure:
     else:
         _clip(axes, curves, names)
     absent = [name.replace("_", " ") for one, name in zip(curves, names, strict=True) if not len(one.time)]
-    axes.set_title("; ".join([words, *([f"no links in {', '.join(absent)}"] if absent else [])]), loc="left")
+    axes.set_title(
+        "; ".join([words, *([f"no {'links' if what == 'spacing_errors' else 'trains'} in {', '.join(absent)}"] if absent else [])]),
+        loc="left",
+    )
     relative = what == "positions" and any(one.known.reference is not None for one in drawn)
     axes.set_ylabel(f"{label[:-5]}, less the reference [km]" if relative else label, parse_math=True)
     instants = [one.instants for one in drawn if len(one.instants)]
@@ -139,6 +142,8 @@ def _span(column: Callable[[Drawn], Floats]) -> Callable[[Drawn], Curve]:
         time, table = _of_trains(drawn, column)
         some = np.isfinite(table).any(axis=1)
         time, table = time[some], table[some]
+        if not len(time):
+            return Curve(time, time)
         return Curve(time, np.nanmean(table, axis=1), np.nanmin(table, axis=1), np.nanmax(table, axis=1))
 
     return curve
