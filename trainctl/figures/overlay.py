@@ -176,5 +176,5 @@ QUANTITIES: dict[str, tuple[Callable[[Drawn], Curve], str, str]] = {
     "positions": (_positions, "position [km]", "every train"),
     "spacing_errors": (_worst, r"largest $|x_{ij} - d_{ij}|$ [m]", "the worst link of each run"),
     "speeds": (_span(lambda d: d.trains.column("speed_mps")), "speed [m/s]", "mean, shaded from the slowest to the fastest train"),
-    "inputs": (_span(lambda d: d.trains.column("input_mps2")), r"input [m/s$^2$]", "mean, shaded from the lowest to the highest"),
+    "inputs": (_span(lambda d: d.trains.column("input_mps2")), "input [m/s²]", "mean, shaded from the lowest to the highest"),
 }  # fmt: skip
