@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import cached_property
 from io import BytesIO
-from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -228,12 +227,12 @@ class Simulation:
 
     @property
     def position_m(self) -> Floats:
-        """Front of every train on the line, shape (n,)."""
+        """Front of every train on the line [m], shape (n,)."""
         return self._loop.world.measure().position.copy()
 
     @property
     def speed_mps(self) -> Floats:
-        """Speed of every train's head, shape (n,)."""
+        """Speed of every train's leading unit [m/s], shape (n,)."""
         return np.asarray(self._loop.state.own[self._loop.p.leading, SPEED].copy())
 
     @property
@@ -265,13 +264,13 @@ class Simulation:
     def units(self) -> pd.DataFrame:
         """One row per unit: train, unit, position_m, speed_mps."""
         first, own = self._loop.p.consists.first, self._loop.state.own
-        names = [(name, k + 1) for name, (a, b) in zip(self.trains, pairwise(first), strict=True) for k in range(b - a)]
-        frame = pd.DataFrame(names, columns=["train", "unit"])
+        names = np.repeat(np.array(self.trains, dtype=object), np.diff(first))
+        frame = pd.DataFrame({"train": names, "unit": self._loop.p.unit})
         return frame.assign(position_m=own[:, POSITION], speed_mps=own[:, SPEED])
 
     @property
     def links(self) -> pd.DataFrame:
-        """Who hears whom in the last step: sender, receiver, spacing_m, desired_m, lower_m, upper_m, heard."""
+        """Who received from whom in the last step: sender, receiver, spacing_m, desired_m, lower_m, upper_m, heard."""
         links = self._loop.state.formed.links
         if links is None:  # before the first step
             links = self._loop.p.first_links
@@ -287,7 +286,7 @@ class Simulation:
     def reference_of(self, train: str) -> tuple[float, float]:
         """Position [m] along the train's own way and speed [m/s] of the reference it follows now.
 
-        Where trains come and go that is the reference of its formation; a train in none follows nobody but itself.
+        Where trains come and go that is the reference of its formation; a train in none is a reference of its own.
         """
         i, formed = self._number(train), self._loop.state.formed
         if not formed.led[i]:

@@ -69,7 +69,7 @@ class ContinuousLaw(Protocol):
     Arrays ``own``, ``estimate``, ``correction`` and ``out`` hold the units of train ``i`` only, ``desired`` and ``heard``
     what its links bring: locality by construction. ``constants`` is a NamedTuple of floats and arrays made by ``constants()``;
     per-unit arrays in it are indexed from its own ``first[i]``. ``leader`` is (4,): position, speed, acceleration, jerk of the
-    reference now; ``slot`` the train's wanted position relative to it [m].
+    reference now; ``slot`` the train's nominal position relative to it [m].
     """
 
     CLOCK: Literal["continuous"]
@@ -90,7 +90,7 @@ class ContinuousLaw(Protocol):
     ) -> None:  # fmt: skip
         """Write the demanded force of each unit [N] into ``out``.
 
-        ``desired`` (k,) and ``heard`` (k, w) are the rows of the k links train ``i`` hears on; ``age`` [s] is how old ``heard`` is
+        ``desired`` (k,) and ``heard`` (k, w) are the rows of the k links to train ``i``; ``age`` [s] is how old ``heard`` is
         (0 in the exact mode).
         """
 
@@ -126,6 +126,12 @@ class Observer(Protocol):
 
     def initial(self, params: Any, own: Floats) -> Floats:
         """Estimates at the start, shape (U, width)."""
+
+    def turned(self, params: Any, estimate: Floats, before: Floats, after: Floats) -> Floats:
+        """Estimates (k, width) of units of a train that has turned round: fronts ``before`` (k,) are ``after`` [m] now.
+
+        Forward is backward then. An actuator's fault pushes the way its train runs, so its estimate stays.
+        """
 
     def correction(self, i: int, constants: Any, own: Floats, estimate: Floats, held: Bools, out: Floats) -> None:
         """Write the corrections of train ``i``, which the law may read, into ``out`` (units, CORRECTIONS).
