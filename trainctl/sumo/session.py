@@ -290,7 +290,8 @@ class Sumo(Session):
         if train in self.pending:
             self._call(self.api.vehicle.remove, name)
         edge = self.line.edges[self.ways.edge[self.ways.first[train]]]
-        if speed > self.api.lane.getMaxSpeed(f"{edge}_0"):  # a sign shows more than the net has
+        lanes = range(self.api.edge.getLaneNumber(edge))
+        if speed > max(self.api.lane.getMaxSpeed(f"{edge}_{k}") for k in lanes):  # a sign shows more than the net has
             self._call(self.api.edge.setMaxSpeed, edge, speed)
         if f"way_{name}" not in self.api.route.getIDList():
             self._call(self.api.route.add, f"way_{name}", normal(self.routes[train]))
