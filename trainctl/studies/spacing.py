@@ -98,8 +98,9 @@ def found(plan: StopsPlan, row: str, out: Path, sumo: bool = False) -> dict[str,
         "below": low.what if low is not high else high.what if spacing is None else "the smallest looked at",
     }  # fmt: skip
     if spacing is not None:
-        for share in SHARES:
-            outcome, _ = stopped(plan, row, share * spacing, range(plan.stops), out)
+        for share in SHARES:  # of the spacing itself it is known already
+            done = share == 1.0 and high.of == plan.stops
+            outcome = high if done else stopped(plan, row, share * spacing, range(plan.stops), out)[0]
             told["checked"].append({"share": share, **outcome.plain()})
         told["others"] = stopped(plan, row, spacing, range(plan.stops, 2 * plan.stops), out)[0].plain()
         told |= measured(plan, row, spacing, out)
