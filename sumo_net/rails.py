@@ -252,7 +252,7 @@ def _links(connections: list[dict[str, str]], lanes: dict[str, str], inside: dic
     return list(found.values())
 
 
-def _directions(net: NetFile) -> dict[str, str]:
+def directions(net: NetFile) -> dict[str, str]:
     """For every edge (id) that which is the same track in the other direction, as SUMO 1.28 pairs them; "" if there is none.
 
     Nets since version 1.0 say it. In older ones that say it nowhere it is an edge back between the same nodes whose lanes have
@@ -322,7 +322,7 @@ def _rails(net: NetFile, file: str, over: frozenset[str]) -> Rails:
         raise LineError([f"{file}: has no rail edges: none of its lanes allows a rail class by name"])
     within = [name for name in lane_of if by_id[name].attributes.get("function") == "internal"]
     lanes, inside = ({lane.get("id", ""): name for name in part for lane in open_lanes[name]} for part in (normal, within))
-    bidi = _directions(net)
+    bidi = directions(net)
     links = _links(net.connections, lanes, inside, bidi)
     uses = Counter(edge for link in links for edge in {inside[lane] for lane in link.lanes})
     if shared := [name for name in within if uses[name] > 1]:

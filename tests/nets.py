@@ -29,6 +29,9 @@ UNITS = TYPE | {
     "coupler_damping_ns_per_m": 600.0,
 }  # fmt: skip
 
+#: Among the options of ``convert``: trains turn back where a track ends.
+TERMINALS = "terminals"
+
 EMU = '<vType id="emu" vClass="rail" length="100" maxSpeed="45"/>'
 
 #: What each law needs to run trains at 35 m/s, 1200 m apart.
@@ -89,9 +92,10 @@ def net(
 
 
 def convert(folder: Path, *options: str) -> None:
-    """Make the net of its sources."""
+    """Make the net of its sources: trains turn back nowhere, or with ``TERMINALS`` among the options where a track ends."""
     netconvert, environment = program("netconvert")
-    files = ["-n", "a.nod.xml", "-e", "a.edg.xml", "-o", "a.net.xml", "--no-turnarounds"]
+    files = ["-n", "a.nod.xml", "-e", "a.edg.xml", "-o", "a.net.xml", *([] if TERMINALS in options else ["--no-turnarounds"])]
+    options = tuple(option for option in options if option != TERMINALS)
     subprocess.run([netconvert, *files, *options], cwd=folder, env=environment, check=True, capture_output=True)
 
 
@@ -233,6 +237,26 @@ def single_track(folder: Path, body: str, signals: Collection[str] = ()) -> None
 
 
 UP, DOWN = "left up1 middle up2 right", "-right down2 -middle down1 -left"
+
+
+def terminals(folder: Path, body: str, *options: str, scale: float = 1.0, **more: Any) -> None:
+    """Single track from a terminal ``a`` over ``b``, where a branch to ``d`` leaves it, to one in ``c``; trains turn back in each."""
+    nodes = {
+        name: (scale * x, scale * y) for name, (x, y) in {"a": (0, 0), "b": (4000, 0), "c": (7000, 0), "d": (6500, 900)}.items()
+    }
+    net(folder, nodes, {**both_ways("ab", "a", "b"), **both_ways("bc", "b", "c"), **both_ways("bd", "b", "d")}, TERMINALS, *options)
+    traffic(folder, body, **more)
+
+
+def platforms(folder: Path, body: str) -> None:
+    """A double track, ``up`` and ``down``, that ends in a terminal of two platforms, ``p1`` and ``p2``, in which trains turn back."""
+    net(
+        folder,
+        {"a": (0, 0), "z": (0, -40), "s": (9000, 0), "t1": (10000, 40), "t2": (10000, -40)},
+        {"up": ("a", "s"), "down": ("s", "z"), **both_ways("p1", "s", "t1"), **both_ways("p2", "s", "t2")},
+        TERMINALS,
+    )
+    traffic(folder, body)
 
 
 def diamond(folder: Path) -> None:

@@ -737,6 +737,7 @@ def main() -> None:
     parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="compare with the code there; default 1000 trains")
     parser.add_argument("--instructions", action="store_true", help="count instructions with valgrind: repeatable, but slow")
     parser.add_argument("--logs", type=float, nargs="?", const=40.0, metavar="MB", help="how fast logs of this size are read")
+    parser.add_argument("--ensembles", type=int, nargs="?", const=1000, metavar="RUNS", help="how fast runs side by side are")
     parser.add_argument("--json", action="store_true", help="print a list of rows for machines")
     parser.add_argument("--case", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--public", nargs=3, help=argparse.SUPPRESS)
@@ -752,6 +753,11 @@ def main() -> None:
         case, folder, checkout = asked.public
         of_this(Path(checkout))
         child(case, Path(folder), public)
+    elif asked.ensembles is not None:
+        import bench_ensembles
+
+        rows = bench_ensembles.ensembles(asked.ensembles, asked.repeats or 3)
+        print(json.dumps(rows, indent=2) if asked.json else bench_ensembles.table(rows))
     elif asked.logs is not None:
         import bench_logs
 

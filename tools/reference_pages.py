@@ -14,6 +14,7 @@ from typing import Any
 
 from trainctl.laws import laws
 from trainctl.metrics.run import DEFINITIONS
+from trainctl.metrics.versions import CHANGES
 from trainctl.record import columns
 
 PAGE = Path(__file__).resolve().parent.parent / "scenarios" / "README.md"
@@ -52,6 +53,8 @@ def page() -> Iterator[str]:
         yield f"| `{name}` | {unit} | {text} |"
     yield "\n## Metrics\n"
     yield "`metrics.json` of a run folder, `trainctl metrics RUN`. `name` is the worst or total value, `name/item` that of one."
+    yield "Its `definitions` is the version of the definitions it was computed by; comparisons and page go by the present ones.\n"
+    yield from (f"- {version}: {words}" for version, words in CHANGES.items())
     yield "\n| metric | unit | definition |"
     yield "| --- | --- | --- |"
     for name, (unit, text) in DEFINITIONS.items():

@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import cached_property
 from io import BytesIO
-from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -265,8 +264,8 @@ class Simulation:
     def units(self) -> pd.DataFrame:
         """One row per unit: train, unit, position_m, speed_mps."""
         first, own = self._loop.p.consists.first, self._loop.state.own
-        names = [(name, k + 1) for name, (a, b) in zip(self.trains, pairwise(first), strict=True) for k in range(b - a)]
-        frame = pd.DataFrame(names, columns=["train", "unit"])
+        names = np.repeat(np.array(self.trains, dtype=object), np.diff(first))
+        frame = pd.DataFrame({"train": names, "unit": self._loop.p.unit})
         return frame.assign(position_m=own[:, POSITION], speed_mps=own[:, SPEED])
 
     @property

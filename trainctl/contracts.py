@@ -127,6 +127,12 @@ class Observer(Protocol):
     def initial(self, params: Any, own: Floats) -> Floats:
         """Estimates at the start, shape (U, width)."""
 
+    def turned(self, params: Any, estimate: Floats, before: Floats, after: Floats) -> Floats:
+        """Estimates (k, width) of units of a train that has turned round: fronts ``before`` (k,) are ``after`` [m] now.
+
+        Forward is backward then. An actuator's fault pushes the way its train runs, so its estimate stays.
+        """
+
     def correction(self, i: int, constants: Any, own: Floats, estimate: Floats, held: Bools, out: Floats) -> None:
         """Write the corrections of train ``i``, which the law may read, into ``out`` (units, CORRECTIONS).
 

@@ -66,7 +66,7 @@ class Loop(Steps):
 
     def __init__(self, model: Model, world: World, journal: record.Journal) -> None:
         super().__init__(model, journal)
-        self.world = world
+        self.world, self.built = world, model
         p, run = model, model.scenario.run
         self.ours = ~p.roster.driven
         self.disturbances = disturbance.signals(p.scenario.disturbance, p.scenario.ids, run.step_s, run.seed, p.worst)
@@ -142,6 +142,7 @@ class Loop(Steps):
         # protect, plant: the supervisor tries the step without what disturbs it; the plant then takes it with
         past, units = self.plant.taken(units) if self.record.due(s.k) else (None, units)
         stands = ~(here.present & self.ours) | driven.stands
+        stands[[turn.train for turn in around.turns]] = True
 
         def over_the_step(ordered: Floats, disturbed: Disturbed, state: plant.State, calm: bool) -> plant.Moved:
             moved = self.plant.step(s.k, t, own, demand, ordered, formed, messages, state, disturbed, calm)
@@ -161,8 +162,12 @@ class Loop(Steps):
         told = moved.motion._replace(input=np.where(self.ours, moved.motion.input, np.nan))
         self.record.step(s.k, t, ways, together, seen, own, formed, demand, told, past, acting, watch)
         self.record.waits(t, together, speed, going, around, self.traffic.due(t, going), watch)
+        for turn in around.turns:
+            world.turn(*turn)
         world.move(moved.motion.displacement, p.scenario.run.step_s)
         formed = self.topology.rule.after(formed)
+        if around.turns:
+            moved, formed = self._turned(t, [turn.train for turn in around.turns], moved, formed, going, watch)
         return State(
             s.k + 1, moved.own, ordered, stuck, shown, going, rule, formed, moved.messages, demand, memory, s.commanded,
             moved.state, watch,
@@ -214,7 +219,8 @@ class Loop(Steps):
         start = Start(
             ids=p.scenario.ids, edge=p.roster.edge, lane_position=p.roster.lane_position, speed=speed,
             length=p.consists.train_length(), unit_length=[p.consists.length[a:b] for a, b in pairwise(first)],
-            routes=p.roster.routes, present=s.traffic.came.copy(), vclass=p.roster.vclass, arrival=p.roster.arrival,
+            routes=p.roster.routes, present=s.traffic.came.copy(), vclass=p.roster.vclass,
+            arrival=p.roster.first_arrival,
         )  # fmt: skip
         if due := self.traffic.due(0.0, s.traffic):
             ways = lay_out(p.line, start)
@@ -245,6 +251,32 @@ class Loop(Steps):
         self.world.linked(scene.links, formed.formation)
         self.record.relinked(t, scene, formed, watch)
         return units
+
+    def _turned(
+        self, t: float, trains: list[int], moved: plant.Moved, formed: Formed, going: traffic.State, watch: record.State
+    ) -> tuple[plant.Moved, Formed]:
+        """Trains that have turned round over the step: their units in the new order, and all that is known of them."""
+        own, units, offset = moved.own, moved.state, formed.offset.copy()
+        offset[trains] = 0.0
+        position = self.world.measure().position
+        for i in trains:
+            own, units = self.plant.turned(i, own, float(position[i]), units)
+        formed = formed._replace(offset=offset)
+        self.runs_round(going.leg, trains, watch)
+        if self.p.has_units:
+            assert formed.links is not None
+            scene = self.p.scene(own, formed.links, t)
+            constants = self.p.law.constants(self.p.params, scene)
+            formed = formed._replace(constants=constants, made_of=(t, own.copy(), formed.links))
+            units = self.plant.relinked(scene, constants, units)
+        return moved._replace(own=own, state=units), formed
+
+    def runs_round(self, leg: Ints, trains: list[int], watch: record.State) -> None:
+        """Let the stages that know the units of trains know them as they run after so many turns (n,); ``trains`` turned now."""
+        self.p = p = self.built.turned(leg % 2 == 1)
+        self.record.turned(p, trains, watch)
+        if p.has_units:
+            self.topology, self.plant = topology.Topology(p, self.journal), plant.of(p, p.radio)
 
     def _climb(self, own: Floats, formed: Formed, ways: Any, here: Seen) -> None:
         """Tell the plant the slope of the net under every unit; that of a line it knows by the kilometrage."""

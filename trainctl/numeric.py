@@ -9,7 +9,7 @@ from numba import njit
 
 from sumo_net import Line
 from trainctl.kernels import keep_by_sources
-from trainctl.railway.ways import Ways, rerouted, ways
+from trainctl.railway.ways import Ways, rerouted, turned, ways
 from trainctl.signals import Floats, Ints, Links, Seen, Start
 
 keep_by_sources()  # before anything below is decorated
@@ -53,8 +53,10 @@ class Numeric:
         self.row = self.ways.first[:-1].copy()
         self.lane_position = start.lane_position.copy()
         self.present = start.present.copy()
-        self.arrival = np.full(len(self.row), np.inf) if start.arrival is None else start.arrival
+        self.arrival = np.full(len(self.row), np.inf) if start.arrival is None else start.arrival.copy()
+        self.length = start.length
         self.coming: list[int] = []
+        self.turning: list[tuple[int, tuple[str, ...], float]] = []
 
     def measure(self) -> Seen:
         """Where every train is now."""
@@ -75,6 +77,10 @@ class Numeric:
     def park(self, train: int, off: bool) -> None:
         """It stays where it stands: nobody here is in anybody's way."""
 
+    def turn(self, train: int, edges: tuple[str, ...], arrival: float) -> None:
+        """Let a train turn back with the next move."""
+        self.turning.append((train, edges, arrival))
+
     def halt(self, train: int, stands: bool) -> None:
         """Nobody sets signals here."""
 
@@ -84,10 +90,22 @@ class Numeric:
     def move(self, displacement: Floats, step: float) -> None:
         """Move every train; as in SUMO one on the very end of an edge is still on it, and one near the end of its way is gone."""
         go_on(self.ways, self.line.length_m, np.where(self.present, displacement, 0.0), self.row, self.lane_position)
+        for train, edges, arrival in self.turning:
+            self._turn(train, edges, arrival)
+        self.turning.clear()
         ends = way_lengths(self.ways, self.line, self.arrival) - LEAVES_M
         self.present &= (self.row < self.ways.first[1:] - 1) | (self.lane_position <= ends)
         self.present[self.coming] = True
         self.coming.clear()
+
+    def _turn(self, train: int, edges: tuple[str, ...], arrival: float) -> None:
+        line, row, before = self.line, int(self.row[train]), self.ways.first
+        s = float(self.ways.begin[row] + self.lane_position[train])
+        self.ways, row, place = turned(
+            self.ways, train, row, s, float(self.length[train]), [line.index[e] for e in edges], line.start_m, line.length_m
+        )  # fmt: skip
+        self.row += self.ways.first[:-1] - before[:-1]
+        self.row[train], self.lane_position[train], self.arrival[train] = row, place, arrival
 
     def close(self) -> None:
         """Nothing to end."""

@@ -20,9 +20,11 @@ import tomli_w
 import sumo_net
 from sumo_net import LineError
 from sumo_net.netfile import unpack
+from trainctl.compiling import compiling
 from trainctl.errors import InputError, SimulatorError, left_out
 from trainctl.loop import Loop
 from trainctl.metrics.run import metrics
+from trainctl.metrics.versions import VERSION
 from trainctl.numeric import Numeric
 from trainctl.record import checkpoint
 from trainctl.record.folder import (
@@ -41,7 +43,7 @@ from trainctl.record.folder import (
 )  # fmt: skip
 from trainctl.record.recorder import EVENTS
 from trainctl.record.sums import sealed, sum_of, unsealed, verify
-from trainctl.runs.run import Run
+from trainctl.runs.run import DEFINITIONS_KEY, Run
 from trainctl.scenario import promise, roster
 from trainctl.scenario.build import model_of
 from trainctl.scenario.model import Model
@@ -230,11 +232,11 @@ def _driven(
     simulation: Steps | None = None
     tape: checkpoint.Tape | None = None
 
-    def elapsed() -> float:
-        return round(time.perf_counter() - began, 3)
+    def elapsed() -> float:  # compiling is done once, and says nothing of the run
+        return round(time.perf_counter() - began - compiled.seconds, 3)
 
     try:
-        with _stops() as stop:
+        with compiling() as compiled, _stops() as stop:
             journal = Journal(partial, p, saved.values["recorder"] if saved else None)
             for note in p.roster.notes if saved is None else ():
                 journal.event(0.0, "not_followed", what=note)
@@ -285,7 +287,7 @@ def _complete(p: Model, partial: Path, info: dict[str, Any], done: dict[str, Any
     """Join the tables, measure, and say that the run is complete; may be done again after a kill."""
     (journal or Journal(partial, p, done["recorder"])).join()
     remove(partial / "metrics.json")
-    write_json(partial / "metrics.json", metrics(Run(partial)))
+    write_json(partial / "metrics.json", {DEFINITIONS_KEY: VERSION, **metrics(Run(partial))})
     files = [path for path in written(partial) if path.partition("/")[0] not in (checkpoint.FOLDER, "segments")]
     write_info(partial, {**info, **done["end"], "status": "complete", "wall_time_s": done["wall_time_s"], "files": files})
     _cleared(partial)

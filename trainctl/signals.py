@@ -77,6 +77,25 @@ class Consists(NamedTuple):
         weighted = np.add.reduceat(self.mass[:, None] * self.davis, self.first[:-1])
         return np.asarray(weighted / self.train_mass()[:, None])
 
+    def turned(self, turned: Bools) -> Consists:
+        """The same with the units of some trains (n,) in the opposite order."""
+        rows, between = (turned_rows(self.first, turned, couplers) for couplers in (False, True))
+        return self._replace(
+            length=self.length[rows], mass=self.mass[rows], rotating=self.rotating[rows], davis=self.davis[rows],
+            stiffness=self.stiffness[between], damping=self.damping[between],
+            traction=self.traction[rows], traction_power=self.traction_power[rows],
+            braking=self.braking[rows], braking_power=self.braking_power[rows], actuator_rate=self.actuator_rate[rows],
+        )  # fmt: skip
+
+
+def turned_rows(first: Ints, turned: Bools, couplers: bool = False) -> Ints:
+    """Rows (U,) of units, or of the ``couplers`` behind them, in the order of trains of which some (n,) are turned round."""
+    rows = np.arange(first[-1])
+    for i in np.flatnonzero(turned).tolist():
+        part = slice(int(first[i]), int(first[i + 1]) - couplers)  # nothing is coupled behind the last unit
+        rows[part] = rows[part][::-1].copy()
+    return rows
+
 
 class Links(NamedTuple):
     """Who hears whom now: one row per directed hearing, sorted by receiver. Spacings are front to front, sender minus receiver."""
@@ -332,6 +351,14 @@ class Extremes(NamedTuple):
         return cls(
             low, high, low.copy(), high.copy(), np.full((trains, watched), np.inf), np.full((trains, watched), -np.inf),
             np.zeros(trains), np.zeros((trains, len(POWERS))), np.full((trains, watched), np.nan),
+        )  # fmt: skip
+
+    def turned(self, first: Ints, turned: Bools) -> Extremes:
+        """The same with the units of some trains (n,) in the opposite order."""
+        units, between = (turned_rows(first, turned, couplers) for couplers in (False, True))
+        return self._replace(
+            coupler_min=self.coupler_min[between], coupler_max=self.coupler_max[between],
+            force_min=self.force_min[units], force_max=self.force_max[units],
         )  # fmt: skip
 
 

@@ -53,6 +53,13 @@ class World(Protocol):
     def halt(self, train: int, stands: bool) -> None:
         """Say that a train stands at a stop of its own, or goes on: where signals are obeyed, it asks for none meanwhile."""
 
+    def turn(self, train: int, edges: tuple[str, ...], arrival: float) -> None:
+        """Let a train that stands turn back with the next ``move``, in which it stands: its rear becomes its front.
+
+        ``edges``, internal ones included, begins with the twin of the edge it is on; ``arrival`` is where it leaves on the last of
+        them [m], inf: at its end.
+        """
+
     def linked(self, links: Links, formation: Ints) -> None:
         """Who hears whom from now on, and which formation (n,) every train is in: for simulators that show it."""
 

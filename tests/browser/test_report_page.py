@@ -126,6 +126,22 @@ def test_one_moment_stands_in_one_column_and_one_legend_rules_all_plots(page, br
     assert browser.complaints() == []
 
 
+def test_a_small_map_stays_in_sight_while_plots_are_read(page, browser):
+    browser.open(page)
+    browser.until(READY)
+    browser.run("document.getElementById('plot-inputs').scrollIntoView({block: 'end'})")
+    seen = """
+        const box = document.getElementById('mini').getBoundingClientRect();
+        return box.top >= 0 && box.bottom <= innerHeight && box.height > 20;
+    """
+    browser.until(seen)
+    picture = "return document.getElementById('mini').toDataURL()"
+    before = browser.run(picture)
+    moved_to(browser, 1001)
+    assert browser.run(picture) != before
+    assert browser.complaints() == []
+
+
 def test_an_address_names_a_moment(page, browser):
     browser.open(page)
     browser.until(READY)

@@ -84,6 +84,23 @@ def test_exact_estimates_at_an_equilibrium_stay(observer: Any) -> None:
         np.testing.assert_allclose(rate[:, 1:], 0.0, atol=1e-9)
 
 
+def test_a_train_that_turns_twice_is_estimated_as_before(observer: Any) -> None:
+    """Estimates of a train that turns are mirrored with it; the fault stays, since an actuator's fault runs with its train."""
+    scene, estimate, _ = case(observer)
+    params, kept = observer.Params(), estimate.copy()
+    before, after = scene.own[rows(0), 0], 5000.0 - scene.own[rows(0), 0]
+    turned = observer.turned(params, estimate[rows(0)], before, after)
+    again = observer.turned(params, turned, after, before)
+    assert (estimate == kept).all() and again == pytest.approx(estimate[rows(0)], abs=1e-9)
+    if turned.shape[1]:
+        errors = estimate[rows(0), 0] - before
+        assert turned[:, 0] - after == pytest.approx(-errors, abs=1e-9) and (turned[:, 1] == -estimate[rows(0), 1]).all()
+        constants, whole = observer.constants(params, scene), estimate.copy()
+        whole[rows(0)] = turned
+        faults = (observer.fault_estimate(constants, one)[rows(0)] for one in (estimate, whole))
+        assert next(faults) == pytest.approx(next(faults), abs=1e-9)
+
+
 def test_an_observer_that_breaks_the_contract_is_found_out() -> None:
     good = OBSERVERS["intermediate"]
 

@@ -7,6 +7,7 @@ import json
 import math
 import sys
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -166,12 +167,16 @@ def show_json(value: Any) -> None:
 
 
 class Progress:
-    """A progress bar on stderr, or nothing."""
+    """A progress bar on stderr, or nothing; either says when something is compiled first."""
 
-    def __init__(self, title: str, shown: bool) -> None:
-        self.title, self.shown = title, shown
+    def __init__(self, title: str, shown: bool, quiet: bool = False) -> None:
+        self.title, self.shown, self.quiet = title, shown, quiet
 
     def __enter__(self) -> Callable[[int, int], None]:
+        from trainctl.compiling import compiling
+
+        self.inside = ExitStack()
+        self.inside.enter_context(compiling(None if self.quiet else self._tell))
         if not self.shown:
             return lambda done, steps: None
         from rich.console import Console
@@ -181,9 +186,16 @@ class Progress:
         columns = (TextColumn(self.title), BarColumn(), MofNCompleteColumn(), TextColumn("steps"), TimeRemainingColumn())
         self.bar = Bar(*columns, console=Console(stderr=True), transient=True)
         self.bar.start()
+        self.inside.callback(self.bar.stop)
         task = self.bar.add_task("", total=None)
         return lambda done, steps: self.bar.update(task, completed=done, total=steps)
 
     def __exit__(self, *_: object) -> None:
+        self.inside.close()
+
+    def _tell(self, words: str) -> None:
+        """Above the bar, or as a line."""
         if self.shown:
-            self.bar.stop()
+            self.bar.console.print(words)
+        else:
+            say(words, error=True)

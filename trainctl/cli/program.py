@@ -78,7 +78,7 @@ def run(
     if elsewhere:
         say(elsewhere, error=True)
     shown = not (quiet or as_json)
-    with Progress(f"{Path(name).stem}", shown and sys.stderr.isatty()) as advance:
+    with Progress(f"{Path(name).stem}", shown and sys.stderr.isatty(), not shown) as advance:
         done = runner.run(model, folder, backend, force, sys.argv, advance, gui_program if gui else None, checkpoint_every)
     if as_json:
         show_json({"folder": str(folder), **done.info, "metrics": done.metrics})

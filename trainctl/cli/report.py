@@ -1,4 +1,4 @@
-"""Commands that show results: ``report``, ``compare``, ``claims``."""
+"""Commands that show results: ``report``, ``film``, ``compare``, ``claims``."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ if TYPE_CHECKING:
     from trainctl.runs.run import Run
 
 
-CAPACITY, SPACING = "compare capacity", "compare spacing"
+CAPACITY, SPACING, SUITE = "compare capacity", "compare spacing", "compare suite"
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
     app.command()(report)
+    app.command()(film)
     app.command()(compare)
     app.command()(claims)
 
@@ -37,19 +38,33 @@ def report(
     say(write(Run(folder), out, clock=clock, kmh=kmh))
 
 
+def film(
+    folder: Annotated[Path, typer.Argument(help="Run folder, as `trainctl run` made it.")],
+    out: Annotated[Path | None, typer.Option(help="The file, .gif or .webp; default FOLDER/film.gif.")] = None,
+    seconds: Annotated[float, typer.Option(min=0.2, max=120.0, help="How long the picture lasts.")] = 15.0,
+    from_s: Annotated[float | None, typer.Option(help="Begin at this time of the run in s.")] = None,
+    until_s: Annotated[float | None, typer.Option(help="End at this time of the run in s.")] = None,
+) -> None:
+    """Write the trains on their tracks as a moving picture, for slides: GIF or WebP."""
+    from trainctl.report.film import film as write
+    from trainctl.runs.run import Run
+
+    say(write(Run(folder), out or folder / "film.gif", seconds=seconds, from_s=from_s, until_s=until_s))
+
+
 def compare(
     names: Annotated[
         list[str],
         typer.Argument(
             metavar="RUN...",
-            help="Run folders; with --controllers all one scenario; or the word capacity or spacing (./capacity is a folder).",
+            help="Run folders; with --controllers all one scenario; or the word capacity, spacing or suite (./suite is a folder).",
         ),
     ],
     controllers: Annotated[
         Literal["all"] | None, typer.Option(help="all: run the scenario under every law that can drive its traffic, and compare.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Where figures and runs go; default runs/compare, runs/capacity, runs/spacing.")
+        Path | None, typer.Option(help="Where figures and runs go; default runs/compare, with a word runs/WORD.")
     ] = None,
     further: Annotated[
         list[str] | None, typer.Option("--law", metavar="FILE", help="With --controllers: a law in a file, too; repeatable.")
@@ -67,11 +82,15 @@ def compare(
     spacing_m: Annotated[
         float | None, typer.Option(help="Desired spacing of the formations in m; default 3000.", rich_help_panel=CAPACITY)
     ] = None,
+    spacings: Annotated[
+        Path | None,
+        typer.Option(help="spacing.json of `trainctl compare spacing`: laws keep what it found.", rich_help_panel=CAPACITY),
+    ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Rows at a time; default one per core.", rich_help_panel=CAPACITY)
     ] = None,
     rows_: Annotated[
-        str | None, typer.Option("--rows", metavar="ROW,...", help="Only these rows.", rich_help_panel=SPACING)
+        str | None, typer.Option("--rows", metavar="ROW,...", help="Only these rows; with suite too.", rich_help_panel=SPACING)
     ] = None,
     stops: Annotated[int | None, typer.Option(help="Emergency stops; default 200.", rich_help_panel=SPACING)] = None,
     searched: Annotated[
@@ -86,6 +105,8 @@ def compare(
     brake_scatter: Annotated[
         float | None, typer.Option(help="Share by which brakes scatter, either way; default 0.05.", rich_help_panel=SPACING)
     ] = None,
+    runs_: Annotated[int | None, typer.Option("--runs", help="Runs of each cell; default 20.", rich_help_panel=SUITE)] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the suite in --out.", rich_help_panel=SUITE)] = False,
     in_sumo: Annotated[
         bool, typer.Option("--in-sumo", help="Check the spacings that were found in SUMO as well.", rich_help_panel=SPACING)
     ] = False,
@@ -97,6 +118,9 @@ def compare(
 
     `trainctl compare spacing` finds for every law the smallest spacing at which nobody touches when the first train makes an
     emergency stop, in all of many stops with late and lost messages and brakes that scatter.
+
+    `trainctl compare suite` runs every law in every situation (join, leave, stop, emergency stop, outage, bursts, gradient, unit
+    lost), 20 times each, into one table and one page.
     """
     from trainctl.cli.console import listing, show, show_json
     from trainctl.runs.run import Run
@@ -117,14 +141,30 @@ def compare(
     if names == ["spacing"] and controllers is None:
         from trainctl.cli.spacing import spacing
 
-        others = {"length-km": length_km, "signals-m": signals_m, "spacing-m": spacing_m, "set": settings}
-        idle = [f"--{key}" for key, value in others.items() if value] + ["--backend"] * (backend != "sumo")
+        others = {
+            "runs": runs_, "resume": resume or None, "length-km": length_km, "signals-m": signals_m, "spacing-m": spacing_m,
+            "spacings": spacings, "set": settings,
+        }  # fmt: skip
+        idle = [f"--{key}" for key, value in others.items() if value is not None] + ["--backend"] * (backend != "sumo")
         if idle:
             raise InputError([f"{option}: not with `trainctl compare spacing`" for option in idle])
         asked = {**of_spacing, "trains": trains, "speed_mps": speed_mps}
         asked = {key: value for key, value in asked.items() if value is not None}
         spacing(asked, rows_, out or Path("runs/spacing"), wanted, workers, as_json, in_sumo)
         return
+    if names == ["suite"] and controllers is None:
+        from trainctl.cli.suite import suite
+
+        options = {
+            **of_spacing, "trains": trains, "length-km": length_km, "speed-mps": speed_mps, "signals-m": signals_m,
+            "spacings": spacings, "set": settings, "in-sumo": in_sumo or None,
+        }  # fmt: skip
+        if idle := [f"--{key.replace('_', '-')}" for key, value in options.items() if value is not None]:
+            raise InputError([f"{option}: not with `trainctl compare suite`" for option in idle])
+        suite(runs_, spacing_m, rows_, out or Path("runs/suite"), workers, resume, as_json)
+        return
+    if runs_ is not None or resume:
+        raise InputError(f"--{'runs' if runs_ is not None else 'resume'}: only with `trainctl compare suite`")
     given: dict[str, Any] = {key.replace("_", "-"): value for key, value in of_spacing.items()}
     given |= {"rows": rows_, "in-sumo": in_sumo or None}
     if idle := [f"--{key}: only with `trainctl compare spacing`" for key, value in given.items() if value is not None]:
@@ -132,11 +172,15 @@ def compare(
     if names == ["capacity"] and controllers is None:
         if settings or backend != "sumo":
             raise InputError("capacity: takes no --set and no --backend; its scenarios lie in --out afterwards")
-        chosen = {key: value for key, value in plan.items() if value is not None}
+        chosen: dict[str, Any] = {key: value for key, value in plan.items() if value is not None}
+        if spacings is not None:
+            from trainctl.studies.capacity import found_in
+
+            chosen["found"] = found_in(spacings)
         _capacity(chosen, out or Path("runs/capacity"), wanted, workers, as_json)
         return
     given = {"workers": workers, "trains": trains, "length-km": length_km, "speed-mps": speed_mps, "signals-m": signals_m}
-    given["spacing-m"] = spacing_m
+    given |= {"spacing-m": spacing_m, "spacings": spacings}
     if idle := [f"--{key}: only with `trainctl compare capacity`" for key, value in given.items() if value is not None]:
         raise InputError(idle)
     out = out or Path("runs/compare")
@@ -201,6 +245,9 @@ def _capacity(given: dict[str, Any], out: Path, formats: tuple[str, ...], worker
         for row in table:
             fill(shown, row["row"].replace("_", " "), *(number(row[key]) for key in list(capacity.COLUMNS.values())[1:]))
         show(shown)
+        for name in capacity.LAW_ROWS if plan.found else ():
+            if plan.found_of(name) is None:
+                say(f"{name}: no safe spacing was found; it runs at {plan.spacing_m:g} m")
         for path in pictures:
             say(path)
     failed = [f"{row['row']}: {row['error']}" for row in table if row["error"]]

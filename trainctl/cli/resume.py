@@ -32,7 +32,7 @@ def resume(
     from trainctl.runs.outcome import summary
 
     shown = not (quiet or as_json)
-    with Progress(folder.name.removesuffix(".partial"), shown and sys.stderr.isatty()) as advance:
+    with Progress(folder.name.removesuffix(".partial"), shown and sys.stderr.isatty(), not shown) as advance:
         done, since = runner.resume(folder, advance)
     if as_json:
         show_json({"folder": str(done.folder), "resumed_from_s": since, **done.info, "metrics": done.metrics})

@@ -26,6 +26,9 @@ STANDS_MPS = 0.1
 #: Speed feedback of a train that follows nobody, and of all below the maximum speed [1/s].
 CRUISE_PER_S = 0.1
 
+#: Share of the room between the speed of the reference and the maximum speed that closing up may use.
+ROOM_TO_CLOSE_UP = 0.75
+
 #: Columns of a message.
 PLACE, SAID_SPEED, SAID_ACCELERATION, SAID_REFERENCE, SAID_BRAKING, SAID = range(6)
 
@@ -90,9 +93,14 @@ def seen(who: Followed, own: Trains, leader: Floats, links: Links, heard: Floats
 
 
 def cruising(own: Trains, leader: Floats, follows: Bools, faster: float, upper: Floats) -> Floats:
-    """Acceleration that takes a train to the reference's speed; one that follows somebody to at most ``faster`` above it."""
+    """Acceleration that takes a train to the reference's speed; one that follows somebody to at most ``faster`` above it.
+
+    A part of the room below the maximum speed ``upper`` (n,) [m/s] is left for what disturbs.
+    """
     n = len(own.speed)
-    speed = np.minimum(np.broadcast_to(leader[SPEED], n) + np.where(follows, faster, 0.0), upper)
+    reference = np.broadcast_to(leader[SPEED], n)
+    room = ROOM_TO_CLOSE_UP * np.maximum(upper - reference, 0.0)
+    speed = np.minimum(reference, upper) + np.where(follows, np.minimum(faster, room), 0.0)
     wanted: Floats = np.broadcast_to(leader[2], n) + CRUISE_PER_S * (speed - own.speed)
     return wanted
 

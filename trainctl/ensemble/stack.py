@@ -136,9 +136,14 @@ def _model(runs: Sequence[Model]) -> Model:
     first = base.consists.first
     units = np.concatenate([[0], np.tile(np.diff(first), len(runs))]).cumsum()
     rows = zip(*(p.consists[1:] for p in runs), strict=True)
+    rosters = {
+        name: np.concatenate([getattr(p.roster, name) for p in runs])
+        for name, value in base.roster._asdict().items()
+        if isinstance(value, np.ndarray)
+    }
     return replace(
         base, scenario=scenario, consists=Consists(units, *(np.concatenate(row) for row in rows)),
-        own=np.concatenate([p.own for p in runs]),
+        own=np.concatenate([p.own for p in runs]), roster=base.roster._replace(**rosters),
         bounds=Bounds(*(np.concatenate(row) for row in zip(*(p.bounds for p in runs), strict=True))),
     )  # fmt: skip
 

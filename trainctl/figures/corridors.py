@@ -24,6 +24,8 @@ from trainctl.signals import Floats
 MOST = 4
 #: Tracks that leave a corridor and come back lie beside it if they are at most so many times as long or as short as what they pass.
 BESIDE = 2.0
+#: A stop that no train reached is drawn if it lies so near the stretch trains covered, as a share of it; else it is just named.
+NEAR = 0.5
 #: Junctions and crossovers named at most; beyond, only those where trains of the run part, meet or cross over.
 NAMED = 12
 
@@ -33,7 +35,7 @@ class Place(NamedTuple):
 
     at_m: float
     name: str
-    kind: str  # "stop", "junction" or "crossover"
+    kind: str  # "stop", "unreached" (a stop to which no train came), "junction" or "crossover"
 
 
 class Scale(NamedTuple):
@@ -50,6 +52,7 @@ class Corridor:
     name: str
     distance: dict[str, Floats]  # of every row of each train that is on it [m], NaN where it is elsewhere
     places: tuple[Place, ...]
+    beyond: tuple[str, ...] = ()  # stops that no train came near
 
 
 def line_of(run: Run) -> Line | None:
@@ -79,8 +82,8 @@ def crossovers(run: Run, trains: Series) -> tuple[Place, ...]:
     return tuple(Place(c.start_m, c.id, "crossover") for c in found)
 
 
-def corridors(run: Run, trains: Series) -> list[Corridor]:
-    """The corridors of a run on a net of any shape, the one with most trains first; at most ``MOST``.
+def corridors(run: Run, trains: Series) -> tuple[list[Corridor], str]:
+    """The corridors of a run on a net of any shape, the one with most trains first; at most ``MOST``, the rest in words.
 
     Parameters
     ----------
@@ -97,7 +100,7 @@ def corridors(run: Run, trains: Series) -> list[Corridor]:
     except (LineError, OSError):
         rails = None
     if rails is None or not set(edge) <= set(rails.edges):
-        return [Corridor("", {name: position[rows] for name, rows in trains.slices()}, ())]
+        return [Corridor("", {name: position[rows] for name, rows in trains.slices()}, ())], ""
     visits = {name: _visits(edge[rows], rails) for name, rows in trains.slices()}
     ways = sorted({tuple(w) for v in visits.values() for w in v}, key=lambda w: (-_length(w, rails), w))
     scales: dict[tuple[int, ...], dict[int, Scale]] = {}
@@ -113,10 +116,21 @@ def corridors(run: Run, trains: Series) -> list[Corridor]:
         at = start[number] + per[number] * (position - rails.start_m[number])
         distance = {name: at[rows] for name, rows in trains.slices() if np.isfinite(at[rows]).any()}
         named = _stops(run, trains, distance)
-        ends = _ends(way, rails, named, np.array([v for d in distance.values() for v in (np.nanmin(d), np.nanmax(d))]))
-        found.append(Corridor(ends, distance, tuple(sorted([*named, *_junctions(nets[0], way, known, ways, rails)]))))
+        known_stops = {place.name for place in named}
+        named += [place for place in _unreached(run, rails, start, per) if place.name not in known_stops]
+        covered = np.array([v for d in distance.values() for v in (np.nanmin(d), np.nanmax(d))])
+        spare = NEAR * float(np.ptp(covered))
+        beyond = tuple(place.name for place in named if not covered.min() - spare <= place.at_m <= covered.max() + spare)
+        named = [place for place in named if place.name not in beyond]
+        ends = _ends(way, rails, [place for place in named if place.kind == "stop"], covered)
+        places = tuple(sorted([*named, *_junctions(nets[0], way, known, ways, rails)]))
+        found.append(Corridor(ends, distance, places, beyond))
     found.sort(key=lambda c: -len(c.distance))
-    return found[:MOST]
+    shown = {name for corridor in found[:MOST] for name in corridor.distance}
+    missing = len(trains.names) - len(shown)
+    more = len(found) - MOST
+    some = f", and {missing} trains with {'it' if more == 1 else 'them'}" if missing else ", whose trains stand in these"
+    return found[:MOST], f"{more} more {'corridor is' if more == 1 else 'corridors are'} not shown{some}" if more > 0 else ""
 
 
 def _visits(edge: Any, rails: Rails) -> list[list[int]]:
@@ -185,6 +199,19 @@ def _stops(run: Run, trains: Series, distance: dict[str, Floats]) -> list[Place]
             if np.isfinite(at):
                 places.setdefault(str(event["stop"]), []).append(float(at))
     return [Place(float(np.median(at)), name, "stop") for name, at in places.items()]
+
+
+def _unreached(run: Run, rails: Rails, start: Floats, per: Floats) -> list[Place]:
+    """Stops on a corridor to which no train came, in the middle of their edge: nobody stood there to say where."""
+    if not len(run.stops):
+        return []
+    calls = run.stops.astype({"stop": str, "platform": str})
+    found = []
+    for (name, edge), rows in calls.groupby(["stop", "platform"], sort=False):
+        e = rails.index.get(str(edge), -1)
+        if e >= 0 and np.isfinite(start[e]) and rows["arrival_s"].isna().all():
+            found.append(Place(float(start[e] + 0.5 * per[e] * rails.length_m[e]), str(name), "unreached"))
+    return found
 
 
 def _ends(way: tuple[int, ...], rails: Rails, stops: list[Place], reached: Floats) -> str:

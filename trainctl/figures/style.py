@@ -45,8 +45,8 @@ COMMON = (
 BOUND, EVENT = "bound", "event"
 #: A bound farther from the data than so many times their range is left to the corner of the panel.
 FAR = 1.5
-#: Height of a line of text as a share of a panel's, and letters of a name beside a panel.
-LINE_SHARE, LETTERS = 0.062, 18
+#: Height of a line of small text, and letters of a name beside a panel.
+LINE_POINTS, LETTERS = 8.4, 18
 #: Ground of words on data.
 PAPER: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.8}
 #: Steps of an axis in hours and minutes [s].
@@ -126,11 +126,17 @@ def _beside(axes: Axes, lines: Sequence[Line2D]) -> None:
             share = axes.transAxes.inverted().transform(axes.transData.transform((x[k], y[k])))[1]
             ends.append((round(float(np.clip(share, 0.0, 1.0)), 2), label, line.get_color()))
     ends.sort(key=lambda end: (end[0], [-value for _, value, _ in _order_of(end[1])]))
-    for place, (_, label, colour) in zip(spread([end[0] for end in ends], LINE_SHARE), ends, strict=True):
+    for place, (_, label, colour) in zip(spread([end[0] for end in ends], line_share(axes)), ends, strict=True):
         axes.annotate(
             label if len(label) <= LETTERS else f"{label[: LETTERS - 1]}…", (1.0, place), xycoords="axes fraction", xytext=(4, 0),
             textcoords="offset points", fontsize=7, va="center", color=colour, annotation_clip=False,
         )  # fmt: skip
+
+
+def line_share(axes: Axes) -> float:
+    """Height of a line of small text as a share of a panel's."""
+    points: float = axes.get_window_extent().height * 72.0 / axes.figure.dpi
+    return LINE_POINTS / points
 
 
 def spread(places: Sequence[float], apart: float) -> list[float]:
@@ -196,19 +202,22 @@ def name_places(axes: Axes, places: Sequence[tuple[float, str, str]]) -> None:
     """Lines across a train graph where something lies, with its name on the right; stops come before what else is near them."""
     low, high = axes.get_ylim()
     inside = [place for place in places if low <= place[0] <= high]
+    lines: dict[str, Any] = {"stop": "-", "unreached": (0, (1, 2))}
     for at, _, kind in inside:
-        axes.axhline(at, color=GREY, linewidth=0.7 if kind == "stop" else 0.4, linestyle="-" if kind == "stop" else ":", zorder=0.5)
+        axes.axhline(at, color=GREY, linewidth=0.7 if kind in lines else 0.4, linestyle=lines.get(kind, ":"), zorder=0.5)
     kept: list[tuple[float, str, str]] = []
-    for place in sorted(inside, key=lambda place: place[2] != "stop"):
-        if len(kept) < 1.0 / LINE_SHARE:
+    apart = line_share(axes)
+    for place in sorted(inside, key=lambda place: place[2] not in lines):
+        if len(kept) < 1.0 / apart:
             kept.append(place)
     kept.sort()
-    where = spread([(at - low) / (high - low) for at, _, _ in kept], LINE_SHARE)
+    where = spread([(at - low) / (high - low) for at, _, _ in kept], apart)
     for (at, name, kind), share in zip(kept, where, strict=True):
         axes.annotate(
             name if len(name) <= LETTERS else f"{name[: LETTERS - 1]}…", xy=(1.0, (at - low) / (high - low)), xytext=(1.012, share),
             xycoords="axes fraction", textcoords="axes fraction", fontsize=7, va="center", annotation_clip=False,
             color="black" if kind == "stop" else "#555555", fontweight="bold" if kind == "stop" else "normal",
+            fontstyle="italic" if kind == "unreached" else "normal",
             arrowprops={"arrowstyle": "-", "linewidth": 0.4, "color": GREY, "shrinkA": 0, "shrinkB": 0},
         )  # fmt: skip
 

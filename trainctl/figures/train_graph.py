@@ -16,8 +16,8 @@ from matplotlib.patches import Patch
 from trainctl.figures import style
 from trainctl.figures.corridors import Corridor, corridors, crossovers
 from trainctl.figures.occupied import Occupied, along, occupied
-from trainctl.figures.trains import Drawn, in_and_out, in_formation, mark_events
-from trainctl.signals import Floats, leader_over
+from trainctl.figures.trains import GAINED, NUMBERED, Drawn, in_and_out, in_formation, mark_events, to_reference
+from trainctl.signals import Floats
 
 #: Marks on a train's own line where trains come and go, and their words.
 MARKS = {
@@ -25,8 +25,6 @@ MARKS = {
     "conflict": ("D", "waits for its turn"), "reroute": ("o", "new route"), "reroute_refused": ("x", "route refused"),
     "supervisor": ("|", "supervisor acts"), "brake": ("<", "ordered to brake"),
 }  # fmt: skip
-#: Trains of one panel whose numbers stand on their lines, at most.
-NUMBERED = 30
 #: Below this share of the distance covered, a formation is a bundle in which no train is told from another.
 BUNDLE = 0.3
 #: A train later than this at a stop has its delay beside it [s].
@@ -45,20 +43,6 @@ def train_graph(drawn: Drawn) -> Figure:
     distance.
     """
     return _coming_and_going(drawn) if drawn.known.traffic else _on_tracks(drawn)
-
-
-def to_reference(drawn: Drawn) -> tuple[Floats, bool]:
-    """Positions of all rows relative to the reference [m]; of a crowd, whether it is one, what each train gained since its start.
-
-    No one tells the lines of a crowd apart where they are, but who gains on whom.
-    """
-    position, reference = drawn.trains.column("position_m"), drawn.known.reference
-    if reference is None:
-        return position, False
-    relative = position - leader_over(reference, drawn.trains.column("time_s"))[0]
-    if len(drawn.trains.names) <= NUMBERED:
-        return relative, False
-    return relative - np.repeat(relative[drawn.trains.first[:-1]], np.diff(drawn.trains.first)), True
 
 
 def _on_tracks(drawn: Drawn) -> Figure:
@@ -94,7 +78,7 @@ def _on_tracks(drawn: Drawn) -> Figure:
                 )  # fmt: skip
     axes[0].set_ylabel("position [km]")
     if reference is not None:
-        axes[1].set_ylabel("gained on the reference\nsince the start [km]" if crowd else r"$x_i - x_r$ [km]", parse_math=True)
+        axes[1].set_ylabel(GAINED if crowd else r"$x_i - x_r$ [km]", parse_math=True)
     style.time_axis(axes, drawn.instants[0], drawn.instants[-1], drawn.clock)
     mark_events(axes, drawn)
     style.name_places(axes[0], [(p.at_m / 1000, p.name, p.kind) for p in crossovers(drawn.run, drawn.trains)])
@@ -116,7 +100,7 @@ def _on_tracks(drawn: Drawn) -> Figure:
 
 def _coming_and_going(drawn: Drawn) -> Figure:
     """One panel per corridor: trains of two branches that meet nowhere do not cross in it."""
-    found = corridors(drawn.run, drawn.trains)
+    found, left_out = corridors(drawn.run, drawn.trains)
     figure, axes = style.panels(len(found), drawn.width, 84.0 if len(found) == 1 else 66.0)
     time, inside = drawn.trains.column("time_s"), in_formation(drawn)
     rows_of = dict(drawn.trains.slices())
@@ -133,6 +117,12 @@ def _coming_and_going(drawn: Drawn) -> Figure:
         panel.margins(y=0.03)
         if corridor.name:
             panel.set_title(corridor.name, loc="left", fontweight="bold")
+        far = [f"no train came near {', '.join(corridor.beyond)}"] if corridor.beyond else []
+        panel.set_title("; ".join([*far, *([left_out] if left_out and panel is axes[-1] else [])]), loc="right", fontsize=7)
+        unreached = [place.at_m / 1000 for place in corridor.places if place.kind == "unreached"]
+        if unreached:
+            panel.update_datalim([(drawn.instants[0], at) for at in unreached])
+            panel.autoscale_view()
     style.time_axis(axes, drawn.instants[0], drawn.instants[-1], drawn.clock)
     marks = [mark for kind in MARKS for mark in _marks(axes, found, drawn, kind)]
     for panel, corridor in zip(axes, found, strict=True):
@@ -142,6 +132,8 @@ def _coming_and_going(drawn: Drawn) -> Figure:
     if planned:
         common.append(Line2D([], [], color=style.GREY, linestyle=(0, (4, 2)), marker="o", markerfacecolor="white", markersize=3.5,
                              linewidth=0.8, label="planned"))  # fmt: skip
+    if any(place.kind == "unreached" for corridor in found for place in corridor.places):
+        common.append(Line2D([], [], color=style.GREY, linestyle=(0, (1, 2)), linewidth=0.7, label="stop that no train reached"))
     style.legend(figure, drawn.width, [*common, *shades.values(), *marks])
     return figure
 
@@ -176,7 +168,7 @@ def _occupy(
         return [Patch(facecolor=style.GREY, edgecolor=style.GREY, alpha=0.4, label="block held")]
     found = [Patch(facecolor=style.GREY, alpha=0.7, label="train")] if any(held.length.values()) else []
     if held.rates:
-        found.append(Patch(facecolor=style.GREY, alpha=0.3, label=f"braking distance at {held.rate} m/s$^2$"))
+        found.append(Patch(facecolor=style.GREY, alpha=0.3, label=f"braking distance at {held.rate} m/s²"))
     return found
 
 
@@ -263,6 +255,6 @@ def _number(panel: Axes, lines: dict[str, tuple[Floats, Floats]], drawn: Drawn) 
         angle = float(np.degrees(np.arctan2(run[1, 1] - run[0, 1], run[1, 0] - run[0, 0]))) if np.ptp(run) else 0.0
         panel.text(
             float(x[here]), float(y[here]), name, fontsize=6.5, color=drawn.colour[name], rotation=angle, rotation_mode="anchor",
-            ha="center", va="center", zorder=5, clip_on=True, gid=f"number {name}",
+            ha="center", va="center", zorder=7, clip_on=True, gid=f"number {name}",
             path_effects=[effects.withStroke(linewidth=2.2, foreground="white")],
         )  # fmt: skip

@@ -19,6 +19,10 @@ from trainctl.signals import Bools, Floats, leader_over
 
 #: Events that every panel over time marks, where trains do not come and go.
 SHOWN_EVENTS = ("topology", "reroute", "join", "leave", "fault", "limit", "brake", "brake_released")
+#: Trains of one panel whose numbers stand on their lines, at most; more are a crowd.
+NUMBERED = 30
+#: What a crowd is drawn by.
+GAINED = "gained on the reference\nsince the start [km]"
 #: More times than this are marked, but not named.
 NAMED_EVENTS = 6
 
@@ -91,20 +95,33 @@ def drawable(run: Run, width: str = "double", clock: bool = False, kmh: bool = F
     return Drawn(run, facts(run), series(run.trains, "train"), pairs(run.links), units, width, clock, kmh)
 
 
+def to_reference(drawn: Drawn) -> tuple[Floats, bool]:
+    """Positions of all rows relative to the reference [m]; of a crowd, whether it is one, what each train gained since its start.
+
+    No one tells the lines of a crowd apart where they are, but who gains on whom.
+    """
+    position, reference = drawn.trains.column("position_m"), drawn.known.reference
+    if reference is None:
+        return position, False
+    relative = position - leader_over(reference, drawn.trains.column("time_s"))[0]
+    if len(drawn.trains.names) <= NUMBERED:
+        return relative, False
+    return relative - np.repeat(relative[drawn.trains.first[:-1]], np.diff(drawn.trains.first)), True
+
+
 def positions(drawn: Drawn) -> Figure:
-    """Positions against time, and below relative to the reference, where trains 5 km apart can be told from each other."""
+    """Positions against time, and below relative to the reference, see ``to_reference``."""
     reference = drawn.known.reference
     figure, axes = style.panels(1 if reference is None else 2, drawn.width)
     time, position = drawn.trains.column("time_s"), drawn.trains.column("position_m")
-    inside = in_formation(drawn)
+    inside, (relative, crowd) = in_formation(drawn), to_reference(drawn)
     for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
-        relative = position[rows] - (0.0 if reference is None else leader_over(reference, time[rows])[0])
-        for panel, value in zip(axes, (position[rows] / 1000, relative / 1000), strict=False):
+        for panel, value in zip(axes, (position[rows] / 1000, relative[rows] / 1000), strict=False):
             in_and_out(panel, time[rows], value, inside[rows], drawn.colour[name], label)
     if reference is not None:
         instants = drawn.instants
         style.draw(axes[0], instants, leader_over(reference, instants)[0] / 1000, color="black", linestyle=":", label="reference")
-        axes[1].set_ylabel(r"$x_i - x_r$ [km]", parse_math=True)
+        axes[1].set_ylabel(GAINED if crowd else r"$x_i - x_r$ [km]", parse_math=True)
     axes[0].set_ylabel("position [km]")
     _finish(figure, axes, drawn)
     return figure

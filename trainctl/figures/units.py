@@ -23,10 +23,12 @@ def couplers(drawn: Drawn) -> Figure:
     """Coupler displacements: shaded from minimum to maximum over the sub-steps, with the allowed range."""
     figure, axes = style.panels(1, drawn.width, 52.0)
     low, high = at_most(drawn.units, "coupler_min_m", "coupler_m"), at_least(drawn.units, "coupler_max_m", "coupler_m")
-    _bands(axes[0], drawn, drawn.units.column("coupler_m"), low, high)
-    style.bound(axes[0], *drawn.known.coupler_m)
-    axes[0].set_ylabel("coupler displacement [m]")
-    style.room(axes[0], 1e-3)
+    most = float(np.nanmax(np.abs([low, high]), initial=0.0))
+    factor, unit = (1000.0, "mm") if most < 0.01 else (1.0, "m")
+    _bands(axes[0], drawn, factor * drawn.units.column("coupler_m"), factor * low, factor * high)
+    style.bound(axes[0], *(factor * bound for bound in drawn.known.coupler_m))
+    axes[0].set_ylabel(f"coupler displacement [{unit}]")
+    style.room(axes[0], factor * 1e-3)
     return _finished(figure, axes, drawn)
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import numpy as np
 
 from trainctl.metrics.values import Values, at_least, at_most, put_worst
 from trainctl.runs.known import Facts
-from trainctl.runs.series import Series
-from trainctl.signals import Floats
+from trainctl.runs.series import Series, advance, turns
+from trainctl.signals import Bools, Floats
 
 JOULES_PER_KWH = 3.6e6
 #: Below this speed electric brakes give way to friction [m/s] (10 km/h).
@@ -42,10 +45,12 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
 }  # fmt: skip
 
 
-def distance(trains: Series, rows: slice) -> float:
-    """Distance between the first and the last row of a series [m]."""
+def distance(trains: Series, rows: slice, turned: Bools) -> float:
+    """Distance between the first and the last row of a series [m]; see ``runs.series.turns`` for ``turned``."""
     position = trains.column("position_m")[rows]
-    return float(position[-1] - position[0])
+    over = np.flatnonzero(turned[rows])
+    jumps = float((position[over + 1] - position[over]).sum())
+    return float(position[-1] - position[0]) - jumps + float(advance(trains, turned)[rows][over].sum() if len(over) else 0.0)
 
 
 def of_units(trains: Series, units: Series) -> Values:
@@ -71,26 +76,26 @@ def of_units(trains: Series, units: Series) -> Values:
     return values
 
 
-def of_energy(trains: Series, units: Series, known: Facts) -> Values:
-    """Work at the wheel: traction, braking, what could be regenerated, per train-km."""
+def of_energy(trains: Series, units: Series, known: Facts, events: Sequence[Mapping[str, Any]]) -> Values:
+    """Work at the wheel: traction, braking, what could be regenerated, per train-km; ``events`` tell of turns."""
     if not trains.names:
         return {}
     values: Values = {}
-    suffix = ""
+    suffix, turned = "", turns(trains, events)
     if {"traction_j", "braking_j"} <= set(trains.frame.columns):
         source = "integrated over the sub-steps"
         electric = trains.column("speed_mps") > ELECTRIC_BRAKE_FROM_MPS
         traction, braking = np.nan_to_num(trains.column("traction_j")), np.nan_to_num(trains.column("braking_j"))
     elif units.names:
         source = "unit forces held between rows"
-        traction, braking, electric = _works(units, units.column("force_n"))
+        traction, braking, electric = _works(units, units.column("force_n"), turns(units, events))
     elif set(trains.names) <= set(known.mass_kg):
         source = "input times mass held between rows"
         mass = np.repeat([sum(known.mass_kg[name]) for name in trains.names], np.diff(trains.first))
-        traction, braking, electric = _works(trains, trains.column("input_mps2") * mass)
+        traction, braking, electric = _works(trains, trains.column("input_mps2") * mass, turned)
     else:
         source, suffix = "input per mass", "_per_t"
-        traction, braking, electric = _works(trains, trains.column("input_mps2") * 1000.0)
+        traction, braking, electric = _works(trains, trains.column("input_mps2") * 1000.0, turned)
     values["energy.source"] = source
     values[f"energy.traction_kwh{suffix}"] = spent = float(traction.sum()) / JOULES_PER_KWH
     values[f"energy.braking_kwh{suffix}"] = float(braking.sum()) / JOULES_PER_KWH
@@ -98,7 +103,7 @@ def of_energy(trains: Series, units: Series, known: Facts) -> Values:
         return values
     values["energy.regenerable_kwh"] = back = float(braking[electric].sum()) / JOULES_PER_KWH
     values["energy.net_kwh"] = spent - back
-    kilometres = sum(distance(trains, rows) for _, rows in trains.slices()) / 1000
+    kilometres = sum(distance(trains, rows, turned) for _, rows in trains.slices()) / 1000
     if kilometres > 0:
         values["energy.traction_kwh_per_train_km"] = spent / kilometres
         values["energy.net_kwh_per_train_km"] = (spent - back) / kilometres
@@ -109,13 +114,10 @@ def of_energy(trains: Series, units: Series, known: Facts) -> Values:
     return values
 
 
-def _works(split: Series, force: Floats) -> tuple[Floats, Floats, np.ndarray]:
+def _works(split: Series, force: Floats, turned: Bools) -> tuple[Floats, Floats, np.ndarray]:
     """Traction and braking work [J] of each row until the next one, exact for a held force, and where it is above 10 km/h."""
-    position, speed = split.column("position_m"), split.column("speed_mps")
-    ahead = np.zeros(len(position))
-    inside = split.follows()[1:]
-    ahead[:-1] = np.where(inside, np.diff(position), 0.0)
-    work = np.nan_to_num(force) * ahead
+    speed = split.column("speed_mps")
+    work = np.nan_to_num(force) * advance(split, turned)
     return np.maximum(work, 0.0), np.maximum(-work, 0.0), speed > ELECTRIC_BRAKE_FROM_MPS
 
 

@@ -16,7 +16,7 @@ from trainctl.metrics.values import Values, at_least, at_most, put_worst
 from trainctl.monitors.outcome import GAP
 from trainctl.runs.known import UNBOUNDED, Facts, facts
 from trainctl.runs.run import Run
-from trainctl.runs.series import INSTANT, Pairs, Series, pairs, series
+from trainctl.runs.series import INSTANT, Pairs, Series, pairs, series, turns
 from trainctl.signals import Floats, leader_over
 
 #: A bound counts as violated beyond this (m, m/s or m/s2): positions read back from the simulator are exact to 3e-10 m.
@@ -89,10 +89,11 @@ def metrics(run: Run, *, band_m: float = 1.0, speed_band: float = 0.02, section_
     known = facts(run)
     trains, links = series(run.trains, "train"), pairs(run.links)
     time = trains.column("time_s") if trains.names else np.zeros(1)
+    turned = turns(trains, run.events)
     values: Values = {
         "run.duration_s": float(np.ptp(time)),
         "run.trains": len(trains.names),
-        "run.train_km": sum(float(driving.distance(trains, rows)) for _, rows in trains.slices()) / 1000,
+        "run.train_km": sum(driving.distance(trains, rows, turned) for _, rows in trains.slices()) / 1000,
     }
     units = series(run.units, "train", "unit")
     values |= of_bounds(trains, units, links, known)
@@ -101,10 +102,10 @@ def metrics(run: Run, *, band_m: float = 1.0, speed_band: float = 0.02, section_
     values |= of_strings(links)
     values |= of_watched(trains)
     values |= driving.of_units(trains, units)
-    values |= driving.of_energy(trains, units, known)
+    values |= driving.of_energy(trains, units, known, run.events)
     values |= driving.of_comfort(trains)
     inside = [float(event["value"]) for event in run.events if event["kind"] == "violation" and event.get("bound") == GAP]
-    values |= traffic.of_trains(trains, section_m, inside)
+    values |= traffic.of_trains(trains, section_m, inside, turned)
     values |= punctuality.of_entries(run.events)
     values |= punctuality.of_stops(run.stops, float(time.max()))
     try:

@@ -17,7 +17,7 @@ from trainctl.metrics.values import Values, put_worst
 from trainctl.runs.logs import seconds, vehicles
 from trainctl.runs.series import INSTANT, Series
 from trainctl.runs.sumo_logs import elements, find_log
-from trainctl.signals import Floats
+from trainctl.signals import Bools, Floats
 
 #: Headways in time are counted for trains faster than this [m/s]: one that stands has none.
 MOVING_MPS = 1.0
@@ -73,8 +73,11 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
 }
 
 
-def of_trains(trains: Series, section_m: float | None, inside: Sequence[float] = ()) -> Values:
-    """Headways and throughput from our own log; ``inside`` are gaps of trains that were told to overlap, below 0 [m]."""
+def of_trains(trains: Series, section_m: float | None, inside: Sequence[float], turned: Bools) -> Values:
+    """Headways and throughput from our own log.
+
+    ``inside`` are gaps of trains that were told to overlap, below 0 [m]; ``turned`` (rows,) is that of ``runs.series.turns``.
+    """
     if not trains.names:
         return {}
     values: Values = {}
@@ -89,17 +92,17 @@ def of_trains(trains: Series, section_m: float | None, inside: Sequence[float] =
         if np.isfinite(number).any():
             values[f"traffic.{name}"] = float(np.mean(number[np.isfinite(number)]))
     values["traffic.speed_max_mps"] = float(np.max(speed))
-    return values | of_section(trains, section_m)
+    return values | of_section(trains, section_m, turned)
 
 
-def of_section(trains: Series, section_m: float | None) -> Values:
+def of_section(trains: Series, section_m: float | None, turned: Bools) -> Values:
     """Passages of fronts at one kilometrage."""
     position, time = trains.column("position_m"), trains.column("time_s")
     if section_m is None:
         lowest = max(float(position[rows].min()) for _, rows in trains.slices())
         highest = min(float(position[rows].max()) for _, rows in trains.slices())
         section_m = 0.5 * (lowest + highest)
-    before = trains.follows()[1:] & (position[:-1] < section_m) & (position[1:] >= section_m)
+    before = trains.follows()[1:] & ~turned[:-1] & (position[:-1] < section_m) & (position[1:] >= section_m)
     k = np.flatnonzero(before)
     values: Values = {"traffic.section_m": section_m, "traffic.passages": len(k)}
     if len(k):

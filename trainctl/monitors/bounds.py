@@ -54,6 +54,11 @@ class Alarms:
         self.watched: tuple[str, ...] = tuple(getattr(p.law, "WATCHED", ())) if p.has_units and not p.sampled else ()
         self.energy = energy.Balance(p) if p.has_units else None
 
+    def turned(self, p: Model, trains: Sequence[int], s: State) -> None:
+        """Take over a scenario with the units of some trains in another order; these have turned just now."""
+        self.p, self.energy = p, energy.Balance(p) if p.has_units else None
+        s.last[list(trains)] = np.nan  # they are in another place of another way
+
     def initial(self) -> State:
         """Nothing violated yet."""
         n = len(self.p.scenario.train)
@@ -137,7 +142,7 @@ class Alarms:
         ):
             for u in np.flatnonzero(violated).tolist():
                 i = int(np.searchsorted(p.consists.first, u, side="right")) - 1
-                yield _alarm(key, f"{p.scenario.ids[i]}.{u - p.consists.first[i] + 1}", float(value[u]), bound)
+                yield _alarm(key, f"{p.scenario.ids[i]}.{p.unit[u]}", float(value[u]), bound)
 
     def _constrained(self, row: Row, s: State) -> Iterator[Alarm]:
         """The law's own constrained quantities in any sub-step since the last row, against the bounds that held then."""
@@ -179,6 +184,8 @@ class Alarms:
             found = waiting.waits(
                 around.view, around.held, here, speed, rules, assumed, p.scenario.run.step_s, p.step_theta, traffic.standing
             )
+        back = np.flatnonzero(traffic.kept_back >= 0).tolist()
+        found += [Wait(i, int(traffic.kept_back[i]), int(here.edge[i]), waiting.TURN) for i in back]
         if p.driven:  # those whom nothing keeps that is known: their driver would start them
             known = {w.train for w in found}
             stand = np.flatnonzero(waiting.standing(here, speed, traffic.standing)).tolist()

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 STANDS_MPS = 0.05
 
 #: What is waited at; ``Wait.place`` is one of them.
-TRAIN, SWITCH, SIGNAL, ENTRY = "train", "switch", "signal", "entry"
+TRAIN, SWITCH, SIGNAL, ENTRY, TURN = "train", "switch", "signal", "entry", "turn"
 
 
 class Wait(NamedTuple):

@@ -249,6 +249,14 @@ def initial(params: Params, own: Floats) -> Floats:
     return estimate
 
 
+def turned(params: Params, estimate: Floats, before: Floats, after: Floats) -> Floats:
+    """Estimates of units that have turned round: their errors of position and speed do, too, and what is held of faults stays."""
+    estimate = estimate.copy()
+    estimate[:, X] = after - (estimate[:, X] - before)
+    estimate[:, V : W + 1] *= -1.0
+    return estimate
+
+
 @inlined()
 def correction(i: int, constants: Constants, own: Floats, estimate: Floats, held: Bools, out: Floats) -> None:
     """Right-hand sides of (13) with the corrections (14), without the input; then the force of (5) at u = 0."""

@@ -119,6 +119,16 @@ def initial(params: Params, own: Floats) -> Floats:
     return estimate
 
 
+def turned(params: Params, estimate: Floats, before: Floats, after: Floats) -> Floats:
+    """Estimates of units that have turned round: as with ``asymptotic.turned``, the fault estimate xi + kappa w stays."""
+    fault = estimate[:, XI] + params.kappa_per_s * estimate[:, W]
+    estimate = estimate.copy()
+    estimate[:, X] = after - (estimate[:, X] - before)
+    estimate[:, V : W + 1] *= -1.0
+    estimate[:, XI] = fault - params.kappa_per_s * estimate[:, W]
+    return estimate
+
+
 @inlined()
 def correction(i: int, constants: Constants, own: Floats, estimate: Floats, held: Bools, out: Floats) -> None:
     """Write right-hand sides without the input, as ``asymptotic.correction`` does: mu1 = -3 e_x, mu2 = -L1 e_v, mu3 = -L2 e_v."""

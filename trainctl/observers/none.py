@@ -48,6 +48,11 @@ def initial(params: Params, own: Floats) -> Floats:
     return np.zeros((len(own), 0))
 
 
+def turned(params: Params, estimate: Floats, before: Floats, after: Floats) -> Floats:
+    """No estimates."""
+    return estimate
+
+
 @inlined()
 def correction(i: int, constants: Constants, own: Floats, estimate: Floats, held: Bools, out: Floats) -> None:
     """Nothing to correct."""

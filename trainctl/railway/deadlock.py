@@ -6,6 +6,9 @@ behind each other. Train i *needs* train j if j may stand where i still has to p
 of it, or across; or if j goes before it, at its turn or where both stand. A state is *safe* if no train needs, directly or through
 others, itself. A stretch is granted, and a train let into the net, only if it does not need itself afterwards.
 
+A train that turns stands at the end of its way, and needs besides those that may stand where it runs back: on its next leg, on the
+twin of that or across, but for those ahead of it that it turns its rear to.
+
 Circles of joins alone, without single track or crossings, are not looked at (a roundabout that is full): those are told, see
 ``monitors.waiting``.
 
@@ -21,6 +24,7 @@ The test is a search over edges of ways, and for trains behind each other over p
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 from trainctl.railway.along import Net
@@ -30,6 +34,9 @@ from trainctl.signals import Floats, Ints
 #: Whether train j comes before train i to an edge, at its row m of the one and k of the other: (j, m, i, k).
 Before = Callable[[int, int, int, int], bool]
 
+#: Trains that turn at the end of their ways: none.
+NOBODY: Mapping[int, Sequence[int]] = MappingProxyType({})
+
 
 class Standing(NamedTuple):
     """Where trains may come to stand if nothing more is granted."""
@@ -37,13 +44,15 @@ class Standing(NamedTuple):
     ways: Ways
     net: Net
     row: Ints
+    rear: Floats  # (n,) m, of every train now
     on: Mapping[int, Sequence[tuple[int, int, float]]]  # edge: trains that stand on it, its row in their ways, and their rears [m]
     before: Mapping[int, Sequence[int]]  # train: those that go before it where it stands
+    back: Mapping[int, Sequence[int]]  # train that turns: the edges it runs over then
 
 
 def standing(
     ways: Ways, net: Net, row: Ints, s: Floats, length: Floats, clearance: float, limits: Mapping[int, int],
-    turns: Iterable[tuple[int, int, Sequence[int]]], goes_before: Before,
+    turns: Iterable[tuple[int, int, Sequence[int]]], goes_before: Before, back: Mapping[int, Sequence[int]] = NOBODY,
 ) -> Standing:  # fmt: skip
     """Where trains may come to stand.
 
@@ -61,6 +70,8 @@ def standing(
         Train, row of a join, and the trains that have their turns there before it.
     goes_before : callable
         See ``Before``.
+    back : mapping, optional
+        Of trains that turn at the end of their ways: the edges they run over then.
     """
     on: dict[int, list[tuple[int, int, float]]] = {}
     before: dict[int, list[int]] = {i: [] for i in limits}
@@ -88,11 +99,15 @@ def standing(
             behind += length[i]
             stands(i, float(ways.begin[limits[i]]), limits[i], behind)
             behind += clearance
+    for i, k in limits.items():
+        if k < 0 and i in back:
+            last = int(ways.first[i + 1]) - 1
+            stands(i, float(ways.begin[last] + net.length[ways.edge[last]]), last, float(length[i]))
     for i, k, others in turns:
         if others:
             before[i] += others
             stands(i, float(ways.begin[k]), k, float(length[i]))
-    here, known, fresh = Standing(ways, net, row, on, before), set[tuple[int, int]](), True
+    here, known, fresh = Standing(ways, net, row, s - length, on, before, back), set[tuple[int, int]](), True
     while fresh:
         fresh = False
         for i, limit in limits.items():
@@ -114,13 +129,34 @@ def needs(here: Standing, i: int, goes_before: Before) -> Iterable[int]:
         for j, m, _ in here.on.get(int(ways.edge[k]), ()):
             if j != i and i not in here.before[j] and goes_before(j, m, i, k):
                 yield j
+    yield from _behind(here, i, goes_before)
+
+
+def _behind(here: Standing, i: int, goes_before: Before) -> Iterable[int]:
+    """Trains that must have gone before ``i`` can run back once it has turned."""
+    net, ways = here.net, here.ways
+    rows = {int(ways.edge[k]): k for k in range(int(ways.first[i]), int(ways.first[i + 1]))}
+    for e in here.back.get(i, ()):
+        yield from (j for j, _, _ in here.on.get(e, ()) if j != i)
+        for f in (int(net.twin[e]), *net.cross[net.cross_first[e] : net.cross_first[e + 1]].tolist()):
+            for j, m, _ in here.on.get(f, ()):
+                if j != i and not (rows.get(f, -1) >= here.row[i] and goes_before(j, m, i, rows[f])):
+                    yield j
 
 
 def against(here: Standing, i: int, k: int) -> Iterable[int]:
-    """Trains that stand on the twin of, or across, the edge at row k of the way of ``i``."""
-    net, e = here.net, int(here.ways.edge[k])
+    """Trains that stand on the twin of, or across, the edge at row k of the way of ``i``, and do not go away from it."""
+    net, begin, e = here.net, here.ways.begin, int(here.ways.edge[k])
     for f in (int(net.twin[e]), *net.cross[net.cross_first[e] : net.cross_first[e + 1]].tolist()):
-        yield from (j for j, _, _ in here.on.get(f, ()) if j != i)
+        for j, m, rear in here.on.get(f, ()):
+            away = f == net.twin[e] and goes_away(float(here.rear[i] - begin[k]), rear - float(begin[m]), float(net.length[e]))
+            if j != i and not away:
+                yield j
+
+
+def goes_away(rear: float, other: float, length: float) -> bool:
+    """Whether two trains on one track turn their rears to each other: those are so far in from its two ends [m], < 0: not yet."""
+    return rear + other >= length
 
 
 def in_a_circle(here: Standing, i: int, goes_before: Before) -> int:

@@ -13,7 +13,7 @@ later trains may overtake it; this is the only exception to first come, first se
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import NamedTuple, TypedDict
 
 import numpy as np
@@ -67,7 +67,7 @@ def order(state: State) -> Order:
 def request(
     zones: Zones, state: State, row: Ints, s: Floats, length: Floats, present: Bools, reach: Floats,
     clearance: float = 0.0, entering: Bools | None = None, stop: Floats | None = None, stands: Bools | None = None,
-    ordered: Sequence[tuple[int, int, int]] = (), keeps: Bools | None = None,
+    ordered: Sequence[tuple[int, int, int]] = (), keeps: Bools | None = None, back: Mapping[int, Sequence[int]] = deadlock.NOBODY,
 ) -> tuple[State, Held, list[Decision]]:  # fmt: skip
     """Requests of all trains at one instant.
 
@@ -93,6 +93,8 @@ def request(
         Train, a row of its way, and the train that must have passed there first.
     keeps : ndarray, shape (n,), optional
         Of those that ask to enter, who keeps its place at joins; default all.
+    back : mapping, optional
+        Of trains that turn at the end of their ways: the edges they run over then.
 
     Returns
     -------
@@ -148,7 +150,7 @@ def request(
     in_place = _in_place(trains, present, np.flatnonzero(outside).tolist(), clearance)
     granted |= {key: False for key in order if outside[key[0]]}  # it has its place in the queue only
     for i in np.flatnonzero(stands & present).tolist():
-        if _gives_back(trains, present, granted, i, clearance, queues, joins, ordered):
+        if _gives_back(trains, present, granted, i, clearance, queues, joins, ordered, back):
             until[i] = s[i]
             for passed, found in ((stretches, granted), (joins, joins)):
                 for key in [key for key, k in passed.items() if key[0] == i and k > row[i]]:
@@ -192,7 +194,7 @@ def request(
             if blocker < 0:
                 blocker = later if later >= 0 else waiting.blocker(i, rest)
             if blocker >= 0 and later < 0:
-                here = _standing(trains, there, granted, i, (), clearance, queues, joins, ordered)
+                here = _standing(trains, there, granted, i, (), clearance, queues, joins, ordered, back)
                 stuck_itself = any(True for _ in deadlock.needs(here, blocker, trains.before(queues)))
                 if not (stuck_itself or _stood_on(here, zones.ends, i, [k, *rest])):
                     waiting.add(i, [k, *rest])
@@ -201,7 +203,7 @@ def request(
             if blocker < 0 and i in shut and rest and shut[i][0] <= zones.ends[rest[-1]]:
                 blocker = shut[i][1]
             if blocker < 0:
-                here = _standing(trains, there, granted, i, [k, *rest], clearance, queues, joins, ordered)
+                here = _standing(trains, there, granted, i, [k, *rest], clearance, queues, joins, ordered, back)
                 blocker = deadlock.in_a_circle(here, i, trains.before(queues))
         if blocker >= 0:
             stuck.add(i, [k, *rest])
@@ -230,7 +232,7 @@ def request(
     for i in np.flatnonzero(outside & (room > 0.0)).tolist():  # perhaps to stand before what it has not
         blocker = in_place.get(i, -1)
         if blocker < 0:
-            here = _standing(trains, there, granted, i, (), clearance, queues, joins, ordered)
+            here = _standing(trains, there, granted, i, (), clearance, queues, joins, ordered, back)
             blocker = deadlock.in_a_circle(here, i, trains.before(queues))
         if blocker >= 0:
             room[i], zone[i], by[i] = 0.0, edge[row[i]], blocker
@@ -281,7 +283,7 @@ def _until(
 
 def _gives_back(
     trains: Trains, present: Bools, granted: dict[tuple[int, int], bool], i: int, clearance: float, queues: dict[int, list[int]],
-    joins: dict[tuple[int, int], int], ordered: Sequence[tuple[int, int, int]],
+    joins: dict[tuple[int, int], int], ordered: Sequence[tuple[int, int, int]], back: Mapping[int, Sequence[int]],
 ) -> bool:  # fmt: skip
     """Whether all can still get out if ``i`` does without what lies ahead of it."""
     ways = trains.zones.ways
@@ -289,7 +291,7 @@ def _gives_back(
     without = {key: g and not (key[0] == i and key[1] in ahead) for key, g in granted.items()}
     if without == granted:
         return True
-    here = _standing(trains, present, without, i, (), clearance, queues, joins, ordered)
+    here = _standing(trains, present, without, i, (), clearance, queues, joins, ordered, back)
     return deadlock.in_a_circle(here, i, trains.before(queues)) < 0
 
 
@@ -328,6 +330,7 @@ def _limit(trains: Trains, granted: dict[tuple[int, int], bool], i: int, more: C
 def _standing(
     trains: Trains, on: Bools, granted: dict[tuple[int, int], bool], i: int, rows: Sequence[int], clearance: float,
     queues: dict[int, list[int]], joins: dict[tuple[int, int], int], ordered: Sequence[tuple[int, int, int]],
+    back: Mapping[int, Sequence[int]],
 ) -> deadlock.Standing:  # fmt: skip
     """Where all may come to stand if ``i`` gets the stretches at these rows."""
     zones, begin, edge = trains.zones, trains.zones.ways.begin, trains.zones.ways.edge
@@ -343,7 +346,7 @@ def _standing(
     turns += [(i, r, [m for m in queues.get(int(edge[r]), ()) if m in limits]) for r in new]  # it would come last
     turns += [(j, k, [first]) for j, k, first in ordered if j in limits]
     return deadlock.standing(
-        zones.ways, zones.net, trains.row, trains.s, trains.length, clearance, limits, turns, trains.before(queues)
+        zones.ways, zones.net, trains.row, trains.s, trains.length, clearance, limits, turns, trains.before(queues), back
     )
 
 

@@ -74,6 +74,43 @@ def rerouted(old: Ways, train: int, row: int, edges: Sequence[int] | Ints, start
     )
 
 
+def turned(
+    old: Ways, train: int, row: int, s: float, length: float, edges: Sequence[int] | Ints, start_m: Floats, length_m: Floats
+) -> tuple[Ways, int, float]:
+    """Ways with the one back for a train that turns where it stands.
+
+    Parameters
+    ----------
+    old : Ways
+        Before the turn.
+    train, row : int
+        The train, and the row of the edge its front is on.
+    s, length : float
+        Its front [m], and its length [m].
+    edges : sequence of int
+        Its way from the twin of that edge on.
+    start_m, length_m : ndarray, shape (E,)
+        As for ``ways``.
+
+    Returns
+    -------
+    tuple of Ways, int and float
+        The new ways, the row of the edge its front is on now, and how far it is on that [m]: its rear has become its front.
+    """
+    a, b = int(old.first[train]), int(old.first[train + 1])
+    new = np.asarray(edges, np.int64)
+    there = Ways(
+        first=old.first + np.where(np.arange(len(old.first)) > train, len(new) - (b - a), 0),
+        edge=np.concatenate([old.edge[:a], new, old.edge[b:]]),
+        begin=np.concatenate([old.begin[:a], _begins(new, float(start_m[new[0]]), start_m, length_m), old.begin[b:]]),
+    )
+    place, k = float(old.begin[row] + length_m[old.edge[row]] - s) + length, 0
+    while place > length_m[new[k]] and k < len(new) - 1:
+        place -= float(length_m[new[k]])
+        k += 1
+    return there, a + k, place
+
+
 def moved(old: Ways, new: Ways, train: int, place: float) -> float:
     """Where a place on the old way of a train [m] lies on its new one: on the same passage of the same edge; NaN if on none."""
     a, b, c, d = old.first[train], old.first[train + 1], new.first[train], new.first[train + 1]

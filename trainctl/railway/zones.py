@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,10 +27,14 @@ class Zones(NamedTuple):
     following: Ints  # (W,) first row of the next stretch after this row's, -1: none
 
 
-def of(ways: Ways, net: Net) -> Zones:
-    """Find the stretches along all ways: edges whose twin, or an edge across them, is on any way as well."""
+def of(ways: Ways, net: Net, later: Sequence[int] | Ints = ()) -> Zones:
+    """Find the stretches along all ways: edges whose twin, or an edge across them, is on any way as well.
+
+    ``later`` are further edges that trains come to run over: those they turn back over.
+    """
     used = np.zeros(len(net.length), bool)
     used[ways.edge] = True
+    used[np.asarray(later, np.int64)] = True
     across = np.repeat(np.arange(len(used)), np.diff(net.cross_first))
     shared = (net.twin >= 0) & used[net.twin]
     shared |= np.bincount(across, weights=used[net.cross], minlength=len(used)) > 0
@@ -79,10 +83,10 @@ class Trains(NamedTuple):
 
 
 class Index:
-    """Which trains request each edge."""
+    """Which trains request each edge, and how far their rears are on it [m], below 0: not yet."""
 
     def __init__(self, zones: Zones, trains: Trains) -> None:
-        self.zones, self.trains, self.on = zones, trains, dict[int, list[int]]()
+        self.zones, self.trains, self.on = zones, trains, dict[int, list[tuple[int, float]]]()
 
     def add(self, i: int, rows: Iterable[int]) -> None:
         """Put in train ``i`` on what its rear has not left of the stretches that begin at these rows."""
@@ -91,17 +95,23 @@ class Index:
         for k in rows:
             for r in range(k, self.zones.ends[k] + 1):
                 if ways.begin[r] + self.zones.net.length[ways.edge[r]] > rear:
-                    self.on.setdefault(int(ways.edge[r]), []).append(i)
+                    self.on.setdefault(int(ways.edge[r]), []).append((i, float(rear - ways.begin[r])))
 
     def blocker(self, i: int, rows: Iterable[int]) -> int:
-        """A train that requests the twin of, or what is across, an edge of the stretches of ``i`` at these rows; -1: none."""
-        net, edge = self.zones.net, self.zones.ways.edge
+        """A train that requests the twin of, or what is across, an edge of the stretches of ``i`` at these rows; -1: none.
+
+        Who runs the other way on one track and has its rear behind that of ``i`` goes away from it: one of the two has turned.
+        """
+        net, edge, begin = self.zones.net, self.zones.ways.edge, self.zones.ways.begin
+        rear = self.trains.s[i] - self.trains.length[i]
         for k in rows:
             for r in range(k, self.zones.ends[k] + 1):
                 e = int(edge[r])
                 for f in (int(net.twin[e]), *net.cross[net.cross_first[e] : net.cross_first[e + 1]].tolist()):
-                    for j in self.on.get(f, ()):
-                        if j != i:
+                    for j, inside in self.on.get(f, ()):
+                        if j != i and not (
+                            f == net.twin[e] and deadlock.goes_away(float(rear - begin[r]), inside, float(net.length[e]))
+                        ):
                             return j
         return -1
 

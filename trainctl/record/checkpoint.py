@@ -87,11 +87,13 @@ class Tape:
 
     def __init__(self, world: World, folder: Path, saved: Saved | None = None) -> None:
         self.world, self.path = world, folder / MOVES
-        none: dict[str, Any] = {"steps": 0, "trains": 0, "crc": 0, "routes": [], "entries": [], "parked": [], "halted": []}
+        none: dict[str, Any] = {
+            "steps": 0, "trains": 0, "crc": 0, "routes": [], "entries": [], "parked": [], "halted": [], "turns": [],
+        }  # fmt: skip
         told = saved.values["tape"] if saved else none
         self.steps, self.trains, self.crc = told["steps"], told["trains"], told["crc"]
-        self.routes, self.entries = list(told["routes"]), list(told["entries"])
-        self.parked, self.halted = list(told["parked"]), list(told["halted"])
+        self.routes, self.entries, self.parked = list(told["routes"]), list(told["entries"]), list(told["parked"])
+        self.halted, self.turns = list(told["halted"]), list(told["turns"])
         self.buffer = bytearray()
         size = 8 * self.steps * self.trains
         if saved:
@@ -104,7 +106,8 @@ class Tape:
 
     def replay(self, step: float) -> None:
         """Tell the world, which has just started, everything once more."""
-        routes, entries, parked, halted = (_by_step(told) for told in (self.routes, self.entries, self.parked, self.halted))
+        told = (self.routes, self.entries, self.parked, self.halted, self.turns)
+        routes, entries, parked, halted, turns = (_by_step(one) for one in told)
         rows = max(1, PIECE // (8 * max(self.trains, 1)))
         with self.path.open("rb") as file:
             for k in range(self.steps):
@@ -118,6 +121,8 @@ class Tape:
                     self.world.park(train, off)
                 for train, stands in halted.get(k, ()):
                     self.world.halt(train, stands)
+                for train, (edges, arrival) in turns.get(k, ()):
+                    self.world.turn(train, tuple(edges), np.inf if arrival is None else arrival)
                 self.world.move(piece[k % rows].copy(), step)
 
     def start(self, start: Start) -> None:
@@ -143,6 +148,11 @@ class Tape:
         """Take a train off its track, or put it back."""
         self.parked.append((self.steps, train, off))
         self.world.park(train, off)
+
+    def turn(self, train: int, edges: tuple[str, ...], arrival: float) -> None:
+        """Let a train turn back."""
+        self.turns.append((self.steps, train, [list(edges), None if np.isinf(arrival) else arrival]))
+        self.world.turn(train, edges, arrival)
 
     def halt(self, train: int, stands: bool) -> None:
         """Say that a train stands at a stop, or goes on."""
@@ -182,7 +192,7 @@ class Tape:
         """Everything told until now, safe on the disk, as a checkpoint names it."""
         self._flush()
         os.fsync(self.file.fileno())
-        told = {"routes": self.routes, "entries": self.entries, "parked": self.parked, "halted": self.halted}
+        told = {"routes": self.routes, "entries": self.entries, "parked": self.parked, "halted": self.halted, "turns": self.turns}
         return {"steps": self.steps, "trains": self.trains, "crc": self.crc, **told}
 
     def close(self) -> None:
@@ -345,6 +355,9 @@ def restore(loop: Loop, tape: Tape, saved: Saved) -> None:
     if not (np.array_equal(seen.position, saved.arrays["seen.0"]) and np.array_equal(seen.edge, saved.arrays["seen.1"])):
         raise SimulatorError("the simulator did not come back to where it was: other versions or another network")
     values = saved.values["state"]
+    going = again(f"state.{loop.state._fields.index('traffic')}", loop.state.traffic, saved.arrays, values)
+    if going.leg.any():
+        loop.runs_round(going.leg, [], loop.state.watch)
     # What law and plant made of the last change of topology has shapes and parts of its own: made again, then filled.
     made = again("made_of", MADE_OF, saved.arrays, values)
     scene = loop.p.scene(made[1], made[2], made[0])

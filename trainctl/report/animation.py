@@ -20,6 +20,8 @@ from trainctl.signals import Floats
 FRAMES, CELLS = 2500, 100_000
 #: Minimum number of frames, however many trains.
 FEWEST = 300
+#: Number of 16 bits that stands for none.
+LOWEST = -32768
 #: Events named in the page.
 NAMED_EVENTS = 300
 
@@ -56,7 +58,7 @@ def animation(drawn: Drawn) -> dict[str, Any]:
         "crossovers": [] if line is None else _crossovers(line, tracks, float(np.nanmin(x)), float(np.nanmax(x))),
         "trains": _trains(drawn),
         "time": [round(float(t), 6) for t in times],
-        "position": packed(position), "lateral": packed(lateral), "speed": packed(speed),
+        "position": packed(position), "lateral": _thousandths(lateral), "speed": packed(speed),
         "pairs": pairs, "links": base64.b64encode(links.tobytes()).decode(),
         **_events(drawn),
     }  # fmt: skip
@@ -78,6 +80,12 @@ def _of_traffic(drawn: Drawn) -> dict[str, Any]:
         "crossovers": [], "trains": _trains(drawn), "time": [round(float(t), 6) for t in times], "speed": packed(speed),
         "pairs": pairs, "links": base64.b64encode(links.tobytes()).decode(), **where, **_events(drawn),
     }  # fmt: skip
+
+
+def _thousandths(values: Floats) -> dict[str, str]:
+    """Small numbers in 16 bits, a thousandth each; the lowest one stands for none."""
+    whole = np.where(np.isfinite(values), np.round(1000.0 * np.nan_to_num(values)), float(LOWEST))
+    return {"dtype": "i2", "bdata": base64.b64encode(whole.astype("<i2").tobytes()).decode()}
 
 
 def _trains(drawn: Drawn) -> list[dict[str, Any]]:

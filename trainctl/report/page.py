@@ -14,7 +14,8 @@ import numpy as np
 from trainctl.citation import works
 from trainctl.errors import InputError
 from trainctl.figures.trains import Drawn, drawable
-from trainctl.metrics.run import DEFINITIONS, SLACK, metrics
+from trainctl.metrics.run import DEFINITIONS, SLACK
+from trainctl.metrics.versions import current
 from trainctl.record.folder import plain
 from trainctl.report.animation import animation
 from trainctl.report.panels import panels
@@ -111,7 +112,7 @@ def page(run: Run, *, clock: bool = False, kmh: bool = False) -> str:
     drawn = drawable(run, clock=clock, kmh=kmh)
     if not drawn.trains.names:
         raise InputError(f"{run.folder}: no train was recorded")
-    values = run.metrics if (run.folder / "metrics.json").exists() else metrics(run)
+    values = current(run)
     film = animation(drawn)
     span = [float(drawn.instants[0]), float(drawn.instants[-1])]
     data: dict[str, Any] = {"animation": film, "panels": panels(drawn), "title": drawn.known.title, "span": span}
@@ -236,6 +237,11 @@ def _bounds(values: Mapping[str, Any]) -> str:
     return "".join(rows)
 
 
+def raised(unit: str) -> str:
+    """A unit with its powers above the line."""
+    return unit.replace("s2", "s²").replace("s3", "s³")
+
+
 def three(value: float | str | None) -> str:
     """Three significant digits, no exponent between a thousandth and a million; counts and whole seconds as they are."""
     if value is None:
@@ -268,7 +274,7 @@ def _figures(values: Mapping[str, Any]) -> str:
             shown = value if isinstance(value, int | float) or value is None else escape(str(value))
             rows.append(
                 f'<tr><th scope=row title="{escape(name)}: {escape(definition)}">{words[name]}</th>'
-                f"<td class=n>{three(shown)}</td><td>{escape(unit) if unit != '1' else ''}</td>{mark}</tr>"
+                f"<td class=n>{three(shown)}</td><td>{escape(raised(unit)) if unit != '1' else ''}</td>{mark}</tr>"
             )
     return "".join(rows)
 

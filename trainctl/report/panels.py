@@ -16,8 +16,8 @@ import numpy as np
 from trainctl.figures import style
 from trainctl.figures.corridors import Corridor, Place, corridors, crossovers
 from trainctl.figures.occupied import Occupied, along, occupied
-from trainctl.figures.train_graph import NUMBERED, numbered_at, plans, to_reference
-from trainctl.figures.trains import Drawn, in_formation
+from trainctl.figures.train_graph import numbered_at, plans
+from trainctl.figures.trains import NUMBERED, Drawn, in_formation, to_reference
 from trainctl.metrics.driving import JOULES_PER_KWH
 from trainctl.metrics.values import at_least, at_most
 from trainctl.runs.series import INSTANT
@@ -41,6 +41,14 @@ BOUNDS = 6
 def packed(values: Floats) -> dict[str, str]:
     """Numbers as the plotting library reads them: little-endian 32-bit floats in base64."""
     return {"dtype": "f4", "bdata": base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()}
+
+
+def times(values: Floats) -> dict[str, str]:
+    """Times likewise; whole seconds in 16 bits."""
+    whole = np.asarray(values, float)
+    if len(whole) and np.isfinite(whole).all() and whole.min() >= 0 and whole.max() < 65536 and not (whole % 1.0).any():
+        return {"dtype": "u2", "bdata": base64.b64encode(whole.astype("<u2").tobytes()).decode()}
+    return packed(whole)
 
 
 def panels(drawn: Drawn) -> list[Panel]:
@@ -80,7 +88,7 @@ def _line(x: Floats, y: Floats, name: str, colour: str, lines: int, **look: Any)
     x, y = style.envelope(
         *style.broken(np.asarray(x, float), np.asarray(y, float)), int(np.clip(POINTS_PER_PANEL // lines, minimum, most))
     )
-    return {"x": packed(x), "y": packed(y), "name": name, "color": colour, **look}
+    return {"x": times(x), "y": packed(y), "name": name, "color": colour, **look}
 
 
 def _colour(drawn: Drawn, name: str) -> str:
@@ -148,7 +156,7 @@ def _train_graph(drawn: Drawn) -> Iterator[Panel]:
 def _corridors(drawn: Drawn) -> Iterator[Panel]:
     """One train graph per corridor, with its places by name, train numbers and planned times."""
     time, rows_of = drawn.trains.column("time_s"), dict(drawn.trains.slices())
-    found = corridors(drawn.run, drawn.trains)
+    found, left_out = corridors(drawn.run, drawn.trains)
     held = _not_of_a_crowd(drawn, max(len(corridor.distance) for corridor in found))
     for number, corridor in enumerate(found):
         value = np.full(len(time), np.nan)
@@ -165,6 +173,9 @@ def _corridors(drawn: Drawn) -> Iterator[Panel]:
         title = f"Train graph, {corridor.name}" if corridor.name else "Train graph"
         planned = "Rings are planned times." if any("rings" in trace for trace in traces) else ""
         note = " ".join(words for words in (IN_AND_OUT, planned, held.words) if words)
+        note += f" No train came near {', '.join(corridor.beyond)}." if corridor.beyond else ""
+        if corridor is found[-1] and left_out:
+            note += f" {left_out[0].upper()}{left_out[1:]}."
         yield panel(f"graph{number or ''}", title, "distance [km]", traces, note=note, places=_places(corridor.places))
 
 
@@ -187,7 +198,7 @@ def _shades(drawn: Drawn, held: Occupied, distance: dict[str, Floats], ways: dic
         elif held.length:
             some = np.flatnonzero(np.isfinite(front))
             some = some[:: -(-len(some) // SHADED)]
-            at, sign = packed(time[rows_of[name]][some]), along(ways[name])[some]
+            at, sign = times(time[rows_of[name]][some]), along(ways[name])[some]
             rear, stand = front[some] - sign * held.length[name], front[some] + sign * held.braking[name][some]
             yield {**band, "x": at, "y": packed(rear / 1000), "name": f"rear, train {name}"}
             yield {**band, "x": at, "y": packed(stand / 1000), "name": f"braking distance, train {name}", "fill": True}
@@ -202,7 +213,15 @@ def _plans(drawn: Drawn, corridor: Corridor) -> Iterator[Trace]:
 
 
 def _places(found: tuple[Place, ...]) -> list[dict[str, Any]]:
-    return [{"value": place.at_m / 1000, "name": place.name, "stop": place.kind == "stop"} for place in found]
+    return [
+        {
+            "value": place.at_m / 1000,
+            "name": f"{place.name} (no train came)" if place.kind == "unreached" else place.name,
+            "stop": place.kind == "stop",
+            **({"unreached": True} if place.kind == "unreached" else {}),
+        }
+        for place in found
+    ]
 
 
 #: Of panels of links.
@@ -357,7 +376,7 @@ def _of_units(drawn: Drawn, value: Floats, low: Floats, high: Floats, what: str)
         stretch = -(-len(at) // 500)
         starts = np.arange(0, len(at), stretch)
         minimum, maximum = np.minimum.reduceat(minimum, starts), np.maximum.reduceat(maximum, starts)
-        band = {"color": _colour(drawn, train), "group": train, "band": True, "x": packed(at[starts])}
+        band = {"color": _colour(drawn, train), "group": train, "band": True, "x": times(at[starts])}
         bands += [{**band, "y": packed(minimum), "name": f"minimum, train {train}"}]
         bands += [{**band, "y": packed(maximum), "name": f"maximum, train {train}", "fill": True}]
     return bands + traces

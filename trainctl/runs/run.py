@@ -29,6 +29,9 @@ MOST_EVENTS = 1_000_000
 #: A table may take so much memory [bytes], or as many times what it takes on the disk.
 TABLE_BYTES, TIMES = 1 << 28, 1000
 
+#: Where metrics.json says by which version of the definitions it was computed.
+DEFINITIONS_KEY = "definitions"
+
 
 class Run:
     """A run folder of ours; a run that was killed is read as far as it was closed.
@@ -114,6 +117,21 @@ class Run:
 
     @cached_property
     def metrics(self) -> dict[str, Any]:
+        """Metrics as they stand in metrics.json, by whatever ``definitions`` they were computed."""
+        return {name: value for name, value in self._measured.items() if name != DEFINITIONS_KEY}
+
+    @property
+    def definitions(self) -> int | None:
+        """Version of the definitions of metrics.json, see ``metrics.versions``; None without metrics."""
+        if not (self.folder / "metrics.json").exists():
+            return None
+        version = self._measured.get(DEFINITIONS_KEY, 1)
+        if isinstance(version, bool) or not isinstance(version, int):
+            raise InputError(f"{self.folder / 'metrics.json'}: {DEFINITIONS_KEY} = {version!r:.40}: must be a number of a version")
+        return version
+
+    @cached_property
+    def _measured(self) -> dict[str, Any]:
         """Content of metrics.json."""
         content = _json(self.folder / "metrics.json")
         if not isinstance(content, dict):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -62,6 +64,29 @@ def series(frame: pd.DataFrame, *keys: str) -> Series:
             parts.append(text[part])
         names.append(".".join(reversed(parts)))
     return Series(names, first, frame.iloc[order])
+
+
+def turns(split: Series, events: Iterable[Mapping[str, Any]]) -> Bools:
+    """Rows after which a train turned back before its next one, shape (rows,): there its positions begin anew."""
+    found, time = np.zeros(len(split.frame), dtype=np.bool_), split.column("time_s") if split.names else np.zeros(0)
+    told: dict[str, list[float]] = {}
+    for event in events:
+        if event["kind"] == "turn":
+            told.setdefault(str(event["train"]), []).append(float(event["time_s"]))
+    for _, rows in split.slices() if told else ():
+        for at in told.get(str(split.frame["train"].iloc[rows.start]), ()):
+            k = rows.start + int(np.searchsorted(time[rows], at + INSTANT, side="right")) - 1
+            if rows.start <= k < rows.stop - 1:
+                found[k] = True
+    return found
+
+
+def advance(split: Series, turned: Bools) -> Floats:
+    """Way from every row to the next one of its series [m], 0 from the last, (rows,); over a turn it is what the speeds say."""
+    position, speed, time = (split.column(name) for name in ("position_m", "speed_mps", "time_s"))
+    ahead, over = np.diff(position), turned[:-1]
+    ahead[over] = (0.5 * (speed[:-1] + speed[1:]) * np.diff(time))[over]
+    return np.append(np.where(split.follows()[1:], ahead, 0.0), 0.0)
 
 
 @dataclass(frozen=True)

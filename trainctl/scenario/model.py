@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -21,7 +22,21 @@ from trainctl.railway.signs import Signs
 from trainctl.scenario import limits, promise
 from trainctl.scenario.channel import exchanges
 from trainctl.scenario.tables import Scenario, TrafficTable
-from trainctl.signals import POSITION, SPEED, Bounds, Consists, Floats, Ints, Links, Reference, Scene, leader_at, restrict
+from trainctl.signals import (
+    POSITION,
+    SPEED,
+    Bools,
+    Bounds,
+    Consists,
+    Floats,
+    Ints,
+    Links,
+    Reference,
+    Scene,
+    leader_at,
+    restrict,
+    turned_rows,
+)
 from trainctl.topology import convoys, graph
 from trainctl.topology.exchange import Radio
 
@@ -251,6 +266,31 @@ class Model:
             time=time, step=run.step_s, control_period=run.control_period_s or run.step_s, lead=self.theta,
             sub_step=run.step_s / run.sub_steps if self.plant.UNITS else run.step_s,
         )  # fmt: skip
+
+    @cached_property
+    def unit(self) -> Ints:
+        """Number of every unit in its train as it was built, from 1, shape (U,)."""
+        first = self.consists.first
+        found: Ints = np.arange(first[-1]) - np.repeat(first[:-1], np.diff(first)) + 1
+        return found
+
+    def turned(self, turned: Bools) -> Model:
+        """The same with some trains (n,) turned round, their units in the opposite order; what holds of whole trains stays.
+
+        Lists of [controller] and [observer], one number per carriage, count from the head as a train runs.
+        """
+        units = np.diff(self.consists.first)
+        if not (turned & (units > 1)).any():
+            return self
+        last = {self.scenario.ids[i]: int(units[i]) for i in np.flatnonzero(turned).tolist()}
+        faults = tuple(
+            f.model_copy(update={"unit": last[f.train] + 1 - f.unit}) if f.train in last else f for f in self.scenario.fault
+        )
+        found = copy.copy(self)
+        found.__dict__["consists"] = self.consists.turned(turned)
+        found.__dict__["scenario"] = self.scenario.model_copy(update={"fault": faults})
+        found.__dict__["unit"] = self.unit[turned_rows(self.consists.first, turned)]
+        return found
 
     @cached_property
     def first_scene(self) -> Scene:

@@ -58,7 +58,7 @@ def top_speed(p: Model) -> Floats:
         highest: Floats = np.maximum(float(p.line.speed_mps.max()), start)
         return highest
     limit, index = signs.highest(p.signs, p.rails.speed_mps), p.line.index
-    routes = [float(limit[[index[e] for e in route]].max()) for route in p.roster.routes]
+    routes = [float(limit[[index[e] for e in route]].max()) for route in p.roster.whole_routes]
     highest = np.array(routes) if not p.rerouted else np.full(len(routes), limit.max())  # a reroute may lead anywhere
     found: Floats = np.maximum(p.roster.speed_factor * highest, start)
     return found
@@ -74,7 +74,7 @@ def _slopes(p: Model) -> tuple[Floats, Floats]:
     elif p.rerouted or not p.rails.slope.any():
         ahead = [p.rails.slope] * len(p.roster.routes)
     else:
-        ahead = [p.rails.slope[[p.line.index[e] for e in route]] for route in p.roster.routes]
+        ahead = [p.rails.slope[[p.line.index[e] for e in route]] for route in p.roster.whole_routes]
     down, up = (np.array([max(float((sign * s).max()), 0.0) for s in ahead]) for sign in (-1.0, 1.0))
     return down, up
 

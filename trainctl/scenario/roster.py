@@ -14,6 +14,7 @@ import numpy as np
 from sumo_net import Line, LineError, Rails
 from sumo_net.layout import Gradient
 from trainctl.errors import InputError
+from trainctl.railway import turning
 from trainctl.scenario import mixed, passages
 from trainctl.scenario.tables import Scenario, TrafficTable, Train, TrainType
 from trainctl.scenario.train_types import fitted, train_type
@@ -27,8 +28,8 @@ from trainctl.traffic.read import Configuration, Departure, read_traffic
 #: Name of the [train_type] of all vTypes without data of their own.
 REST = "*"
 
-#: A train that stops at the end of its way stands this far before it [m]; nearer than 0.1 m it would have left.
-STANDS_SHORT_M = 0.2
+#: A train that stops at the end of its way, or turns there, stands this far before it [m]; nearer than 0.1 m it would have left.
+STANDS_SHORT_M = turning.SHORT_M
 
 
 class Stop(NamedTuple):
@@ -44,6 +45,7 @@ class Stop(NamedTuple):
     waits_before: float = 0.0  # m, where a train waits that finds none
     planned: float = math.nan  # s, arrival; NaN: none is planned
     edge: str = ""  # the platform: where it stands
+    leg: int = 0  # number of turns before it; ``place`` counts along that part of the route
 
     def late(self, arrival: float, departure: float = math.nan) -> float:
         """How long after the plan a train leaves [s], or comes, where no departure is planned or none has been; NaN: no plan."""
@@ -62,7 +64,7 @@ class Roster(NamedTuple):
     like: tuple[str, ...]  # who enters as fast as is safe, but no faster than those on its edge: their "avg", the "last"; else ""
     top_speed: Floats  # (n,) m/s
     speed_factor: Floats  # (n,) share of a speed limit that a train keeps to, at most 1: nobody is driven above a limit
-    routes: tuple[tuple[str, ...], ...]  # edge ids, internal ones included
+    legs: tuple[tuple[tuple[str, ...], ...], ...]  # its route in parts, up to its turns and its end: edge ids, with internal ones
     stops: tuple[tuple[Stop, ...], ...]
     cooperates: Bools  # (n,)
     vclass: tuple[str, ...]
@@ -77,6 +79,21 @@ class Roster(NamedTuple):
     rails: Rails
     placed: bool  # by [[train]] tables, all there from the start; else they come and go
 
+    @property
+    def routes(self) -> tuple[tuple[str, ...], ...]:
+        """The ways trains begin with: up to their first turn, if they turn."""
+        return tuple(legs[0] for legs in self.legs)
+
+    @property
+    def whole_routes(self) -> tuple[tuple[str, ...], ...]:
+        """The edges of all legs, one after the other."""
+        return tuple(tuple(edge for leg in legs for edge in leg) for legs in self.legs)
+
+    @property
+    def first_arrival(self) -> Floats:
+        """``arrival`` of trains that do not turn, inf of those that do: they leave on a later leg; shape (n,)."""
+        return np.where([len(legs) > 1 for legs in self.legs], np.inf, self.arrival)
+
 
 def placed(scenario: Scenario, line: Line, rails: Rails | None = None) -> Roster:
     """Trains that stand on a line from the start and run to its end; free of the mistakes ``placing.on_the_line`` finds.
@@ -89,7 +106,7 @@ def placed(scenario: Scenario, line: Line, rails: Rails | None = None) -> Roster
         depart=np.zeros(n), edge=np.array([e for e, _ in places], np.int64), lane_position=np.array([x for _, x in places]),
         arrival=np.full(n, np.inf), speed=np.array([t.speed_mps for t in scenario.train], float), like=("",) * n,
         top_speed=np.full(n, np.inf), speed_factor=np.ones(n),
-        routes=tuple(line.route(t.track, t.position_m) for t in scenario.train), stops=((),) * n, cooperates=np.ones(n, bool),
+        legs=tuple((line.route(t.track, t.position_m),) for t in scenario.train), stops=((),) * n, cooperates=np.ones(n, bool),
         vclass=("rail",) * n, patience=np.inf, notes=(), signs=(), closings=(), source="", driven=np.zeros(n, bool), signals=(),
         handed=None, placed=True, rails=Rails.of(line) if rails is None else rails,
     )  # fmt: skip
@@ -110,7 +127,7 @@ def from_tables(data: Mapping[str, Any], net: Path) -> Roster:
     return Roster(
         **numbers,
         edge=np.array(data["edge"], np.int64),
-        routes=tuple(tuple(route) for route in data["routes"]),
+        legs=tuple(tuple(tuple(leg) for leg in legs) for legs in data["legs"]),
         stops=tuple(tuple(Stop(*stop) for stop in stops) for stops in data["stops"]),
         cooperates=np.array(data["cooperates"], bool),
         like=tuple(data["like"]),
@@ -126,7 +143,7 @@ def from_tables(data: Mapping[str, Any], net: Path) -> Roster:
         driven=np.array(data["driven"], bool),
         signals=tuple(Signal(*one) for one in data["signals"]),
         handed=None if data["handed"] is None else read_back(data["handed"]),
-        rails=Rails.read(net, {e for route in data["routes"] for e in route}),
+        rails=Rails.read(net, {e for legs in data["legs"] for leg in legs for e in leg}),
         placed=False,
     )
 
@@ -185,32 +202,39 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         for k, event in enumerate(scenario.event, 1)
         if event.train in ids and driven[ids.index(event.train)]
     ]
-    trains, routes, stops, arrival = [], [], [], []
+    trains, routes, stops, arrival = list[Train](), list[tuple[tuple[str, ...], ...]](), list[tuple[Stop, ...]](), list[float]()
     factor = np.array([min(traffic.kinds[d.kind].speed_factor, 1.0) for d in traffic.departures])
-    for d, share in zip(traffic.departures, factor.tolist(), strict=True):
+    for d, share, other in zip(traffic.departures, factor.tolist(), driven.tolist(), strict=True):
         try:
-            way = rails.way(d.edges)
-            begin = rails.start_m[way[0]] + np.concatenate([[0.0], np.cumsum(rails.length_m[way[:-1]])])
+            # Trains of SUMO's own turn by themselves.
+            cuts = frozenset() if other else rails.reversal
+            parts = [np.array(leg, np.int64) for leg in turning.legs(rails.way(d.edges).tolist(), cuts)]
+            begins = [rails.start_m[w[0]] + np.concatenate([[0.0], np.cumsum(rails.length_m[w[:-1]])]) for w in parts]
+            way, begin = parts[-1], begins[-1]
             there = float(rails.length_m[way[-1]]) if d.arrival_m is None else d.arrival_m
             # As in SUMO a train that stops beyond the place where it is to leave leaves there.
-            stops.append(_stops(d, rails, way, begin, traffic.begin_s))
-            end = max((s.place - float(begin[-1]) for s in stops[-1] if not s.passing), default=0.0)
+            halts = _stops(d, rails, parts, begins, traffic.begin_s)
+            end = max((s.place - float(begin[-1]) for s in halts if not s.passing and s.leg == len(parts) - 1), default=0.0)
             arrival.append(np.inf if max(there, end) >= float(rails.length_m[way[-1]]) else max(there, end))
-            stops[-1] = _before_the_end(stops[-1], float(begin[-1]) + min(arrival[-1], float(rails.length_m[way[-1]])))
+            ends = [float(b[-1] + rails.length_m[w[-1]]) for b, w in zip(begins, parts, strict=True)]
+            ends[-1] = float(begin[-1]) + min(arrival[-1], float(rails.length_m[way[-1]]))
+            stops.append(_before_the_ends(halts, ends))
+            found += _too_long(d.id, parts, begins, rails, types.get(d.kind))
         except ValueError as error:
             found.append(f"network.sumocfg: train {d.id}: {error}")
             continue
-        routes.append(tuple(rails.edges[e] for e in way.tolist()))
+        routes.append(tuple(tuple(rails.edges[e] for e in part.tolist()) for part in parts))
         trains.append(
             Train(
-                id=d.id, type=d.kind, track=d.edges[0], position_m=float(begin[0] + d.position_m),
+                id=d.id, type=d.kind, track=d.edges[0], position_m=float(begins[0][0] + d.position_m),
                 speed_mps=min(float(d.speed_mps if d.speed_mps is not None else scenario.reference.speed_mps or 0.0),
-                              traffic.kinds[d.kind].max_speed_mps, share * float(rails.speed_mps[way[0]])),
+                              traffic.kinds[d.kind].max_speed_mps, share * float(rails.speed_mps[parts[0][0]])),
             )
         )  # fmt: skip
+    whole = [tuple(edge for leg in legs for edge in leg) for legs in routes]
     if not found:
         found += passages.mistakes(
-            scenario.order, dict(zip(ids, routes, strict=True)),
+            scenario.order, dict(zip(ids, whole, strict=True)),
             {rails.edges[e]: rails.edges[f] for e, f in enumerate(rails.twin.tolist()) if f >= 0},
         )  # fmt: skip
     given, told = None, list[str]()
@@ -222,7 +246,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
             scenario = scenario.model_copy(update={"traffic": driving.model_copy(update={"signals": "obey"})})
             own = [ids[i] for i in np.flatnonzero(driven).tolist()]
             given = handed(traffic.source, ids, own, traffic.begin_s)
-            ways, trips = dict(zip(ids, routes, strict=True)), dict(zip(ids, given.trips, strict=True))
+            ways, trips = dict(zip(ids, whole, strict=True)), dict(zip(ids, given.trips, strict=True))
             ordered, wrong = mixed.constraints(scenario.order, ways, trips, rails, traffic.signals)
             given = given._replace(additional=(*given.additional, *ordered))
             bad, notes = mixed.unkept(traffic.source.elements.others, traffic.signals, given.trips)
@@ -241,7 +265,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         speed=np.array([math.nan if d.speed_mps is None else d.speed_mps for d in departures]),
         top_speed=np.array([traffic.kinds[d.kind].max_speed_mps for d in departures]),
         speed_factor=factor,
-        routes=tuple(routes),
+        legs=tuple(routes),
         stops=tuple(stops),
         cooperates=together,
         vclass=tuple(traffic.kinds[d.kind].vclass for d in departures),
@@ -252,7 +276,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
             *traffic.notes,
             *told,
             *fitted(kind for name, kind in traffic.kinds.items() if name not in scenario.train_type),
-            *_slower(scenario, traffic, rails, routes),
+            *_slower(scenario, traffic, rails, whole),
         ),
         closings=tuple(c._replace(begin=c.begin - traffic.begin_s, end=c.end - traffic.begin_s) for c in traffic.closings),
         source=str((folder / str(scenario.network.sumocfg)).resolve()),
@@ -308,9 +332,11 @@ def _types(scenario: Scenario, traffic: Configuration, ours: Collection[str]) ->
     return types, found
 
 
-def _stops(departure: Departure, rails: Rails, way: Ints, begin: Floats, begin_s: float) -> tuple[Stop, ...]:
+def _stops(departure: Departure, rails: Rails, parts: list[Ints], begins: list[Floats], begin_s: float) -> tuple[Stop, ...]:
     """Stops in the order of the way; an edge that is passed more than once has those behind the last place on its next passage."""
     found, row, last = [], 0, departure.position_m
+    way, begin = np.concatenate(parts), np.concatenate(begins)
+    leg = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     normal = np.flatnonzero(~rails.internal[way])
     for stop in departure.stops:
         edge = rails.index[stop.edge]
@@ -325,8 +351,23 @@ def _stops(departure: Departure, rails: Rails, way: Ints, begin: Floats, begin_s
         planned = math.nan if stop.arrival_s is None else stop.arrival_s - begin_s
         lots, depth = (math.inf, 0.0) if stop.area is None else (float(stop.area.lots), stop.area.depth_m)
         place, name = float(begin[row] + stop.position_m), stop.name or stop.edge
-        found.append(Stop(place, stop.duration_s, until, name, stop.pass_mps, stop.parks, lots, depth, planned, stop.edge))
+        found.append(
+            Stop(place, stop.duration_s, until, name, stop.pass_mps, stop.parks, lots, depth, planned, stop.edge, int(leg[row]))
+        )  # fmt: skip
     return tuple(found)
+
+
+def _too_long(train: str, parts: list[Ints], begins: list[Floats], rails: Rails, of: TrainType | None) -> list[str]:
+    """Turns that a train is too long for."""
+    length, found = 0.0 if of is None else float(of.per_unit("unit_length_m").sum()), []
+    for leg, begin, onward in zip(parts, begins, parts[1:], strict=False):
+        yard = turning.yard(leg, begin, onward, rails.twin, rails.internal, rails.length_m, length)
+        if not len(yard.places):
+            found.append(
+                f"network.sumocfg: train {train}: cannot turn back from edge {rails.edges[leg[-1]]} to edge"
+                f" {rails.edges[onward[0]]}: its {length:g} m do not fit on the track that its route runs back over"
+            )
+    return found
 
 
 def _changes(scenario: Scenario, traffic: Configuration) -> tuple[str, ...]:
@@ -359,6 +400,6 @@ def _slower(scenario: Scenario, traffic: Configuration, rails: Rails, routes: li
     ]
 
 
-def _before_the_end(stops: tuple[Stop, ...], end: float) -> tuple[Stop, ...]:
-    """Stops with none so near to the end of a way that the train would leave instead: SUMO's own trains stand short of it, too."""
-    return tuple(s if s.passing else s._replace(place=min(s.place, end - STANDS_SHORT_M)) for s in stops)
+def _before_the_ends(stops: tuple[Stop, ...], ends: list[float]) -> tuple[Stop, ...]:
+    """Stops with none so near to the end of its leg that the train would leave: SUMO's own trains stand short of it, too."""
+    return tuple(s if s.passing else s._replace(place=min(s.place, ends[s.leg] - STANDS_SHORT_M)) for s in stops)

@@ -124,6 +124,12 @@ class Points:
         """Nothing here depends on who hears whom."""
         return state
 
+    def turned(self, train: int, own: Floats, front: float, state: State) -> tuple[Floats, State]:
+        """``own`` and state of a train that has turned round: its rear, now its front, is at ``front`` [m]."""
+        own = own.copy()
+        own[train, POSITION] = front
+        return own, state
+
     def taken(self, state: State) -> tuple[Extremes | None, State]:
         """No extremes: a point has no sub-steps."""
         return None, state
@@ -174,6 +180,23 @@ class Units:
         per_unit = resistance(v, c.davis) + self._climbing(own)
         total: Floats = np.add.reduceat(c.mass * per_unit, c.first[:-1]) / self.masses
         return total
+
+    def turned(self, train: int, own: Floats, front: float, state: State) -> tuple[Floats, State]:
+        """``own`` and state of a train that has turned round, its units in the order they have run in until now.
+
+        Its rear, now its front, is at ``front`` [m]. Couplers stay as they are. Brakes stay on, traction is let go.
+        """
+        first = self.p.consists.first
+        rows, turned = slice(int(first[train]), int(first[train + 1])), np.arange(len(first) - 1) == train
+        own, estimate = own.copy(), state.estimate.copy()
+        before = own[rows, POSITION].copy()
+        rears = before - self.p.consists.length[rows]
+        after = front - (rears - rears[-1])
+        estimate[rows] = self.p.observer.turned(self.p.observer_params, estimate[rows], before, after)[::-1]
+        own[rows, POSITION] = after
+        own[rows, FORCE:] = np.minimum(own[rows, FORCE:], 0.0)
+        own[rows] = own[rows][::-1].copy()
+        return own, state._replace(estimate=estimate, extremes=state.extremes.turned(first, turned))
 
     def taken(self, state: State) -> tuple[Extremes | None, State]:
         """Extremes since they were last taken."""

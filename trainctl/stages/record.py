@@ -54,8 +54,12 @@ class Journal:
         self.recorder = Recorder(folder, tables, {"scenario_sha256": p.scenario.hash()}, resume=resume)
         self.saved = time.monotonic()
         self.train_of_unit = np.repeat(np.arange(len(p.scenario.train)), np.diff(p.consists.first))
-        self.unit = np.arange(len(self.train_of_unit)) - p.consists.first[:-1][self.train_of_unit] + 1
+        self.unit = p.unit
         self.train_length = p.consists.train_length()
+
+    def turned(self, p: Model) -> None:
+        """Take over a scenario with the units of some trains in another order."""
+        self.p, self.unit = p, p.unit
 
     def event(self, time: float, kind: str, **fields: Any) -> None:
         """One line of events.jsonl."""
@@ -72,7 +76,7 @@ class Journal:
         now = columns.trains(row, self.train_length)
         numbers: dict[str, Any] = {name: value(now) for name, value in columns.TRAINS.items()}
         if self.has_units:
-            numbers |= self._units(row, here)
+            numbers |= self._units(row)
         if self.has_energies:
             assert row.extremes is not None
             numbers |= {name: row.extremes.energy[:, q] for q, name in enumerate(ENERGIES)}
@@ -91,10 +95,11 @@ class Journal:
                 **{name: value(row) for name, value in columns.LINKS.items()},
             )  # fmt: skip
 
-    def _units(self, row: Row, here: Any) -> dict[str, Any]:
+    def _units(self, row: Row) -> dict[str, Any]:
         """Write the units; returns the further columns of the trains."""
         now = columns.units(row, self.p.consists)
-        units = here if isinstance(here, slice) else np.flatnonzero(row.seen.present[self.train_of_unit])
+        units = np.lexsort((self.unit, self.train_of_unit))  # as they were built, whichever way they run
+        units = units[row.seen.present[self.train_of_unit[units]]]
         missing = np.full(len(self.unit), np.nan)
         values: dict[str, Any] = {
             "train": self.train_of_unit, "unit": self.unit, **{name: value(now) for name, value in columns.UNITS.items()},
@@ -143,6 +148,12 @@ class Record:
     def initial(self) -> State:
         """Nothing seen."""
         return State(self.alarms.initial(), np.zeros(len(self.p.scenario.ids), bool))
+
+    def turned(self, p: Model, trains: Sequence[int], s: State) -> None:
+        """Take over a scenario with the units of some trains in another order; these have turned just now."""
+        self.p = p
+        self.journal.turned(p)
+        self.alarms.turned(p, trains, s.alarms)
 
     def due(self, k: int) -> bool:
         """Whether a row is written at step ``k``."""

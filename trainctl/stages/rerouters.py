@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,6 @@ import numpy as np
 from trainctl import draws
 from trainctl.railway.ways import Ways
 from trainctl.scenario.model import Model
-from trainctl.scenario.roster import Stop
 from trainctl.signals import Floats, Ints, Seen
 from trainctl.stages.record import Journal
 
@@ -99,7 +98,7 @@ class Rerouters:
         rails, roster = self.p.rails, self.p.roster
         top, share = float(roster.top_speed[i]), float(roster.speed_factor[i])
         cost = rails.length_m / np.minimum(top, share * rails.speed_mps)
-        halts = [e for e in (self.p.line.index[s] for s in _edges_of(roster.stops[i], roster.routes[i], self.p)) if e in way[kept:]]
+        halts = [e for e in (rails.index[s.edge] for s in roster.stops[i]) if e in way[kept:]]
         found = way[:kept]
         for target in [*(e for e in halts if e not in closed), way[-1]]:
             part = rails.path(found[-1], target, cost, closed)
@@ -112,9 +111,3 @@ class Rerouters:
         """A number in [0, 1) for train ``i`` at closing ``k``."""
         word = draws.word(self.p.scenario.ids[i])
         return float(draws.uniform(self.p.scenario.run.seed or 0, draws.REROUTER, np.array([k]), np.array([[word, 0]]))[0, 0])
-
-
-def _edges_of(stops: Sequence[Stop], route: Sequence[str], p: Model) -> list[str]:
-    """The edges of stops along a route."""
-    ends = np.cumsum([p.rails.length_m[p.rails.index[e]] for e in route]) + float(p.rails.start_m[p.rails.index[route[0]]])
-    return [route[min(int(np.searchsorted(ends, s.place - 1e-6)), len(route) - 1)] for s in stops]

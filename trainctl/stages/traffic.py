@@ -13,12 +13,12 @@ from trainctl.railway import along, aspects, authority, interlocking, signs, sup
 from trainctl.railway.authority import DRIVER_MARGIN_M, View
 from trainctl.railway.interlocking import Held
 from trainctl.railway.ways import Ways, moved
-from trainctl.railway.ways import ways as laid
 from trainctl.record.columns import Call
 from trainctl.scenario.model import Model
 from trainctl.scenario.roster import Stop
 from trainctl.signals import Bools, Floats, Ints, Seen
 from trainctl.stages.record import Journal
+from trainctl.stages.turns import Turn, Turns, stopping
 
 #: A train that is slower and nearer to its stop than this has reached it [m/s], [m].
 STANDS_MPS, STOP_BAND_M = 0.05, 2.0
@@ -47,12 +47,15 @@ class State(NamedTuple):
     parked: Bools  # off the track, at a stop
     waits_for: Ints  # train that each is held by at a switch, -1 if none
     kept_out: Ints  # train that keeps each from entering, -1 if none
+    leg: Ints  # how often each has turned
+    turns_since: Floats  # s, while a train stands to turn, else NaN
+    kept_back: Ints  # train that keeps each from turning, -1 if none
     requests: interlocking.State
 
     @property
     def standing(self) -> Bools:
-        """Trains that stand at a stop."""
-        stands: Bools = ~np.isnan(self.stands_until)
+        """Trains that stand at a stop, or to turn."""
+        stands: Bools = ~(np.isnan(self.stands_until) & np.isnan(self.turns_since))
         return stands
 
     def on_track(self, seen: Seen) -> Seen:
@@ -69,6 +72,7 @@ class Around(NamedTuple):
     held: Held | None  # how far each may go before a place that is another's; None: nobody asks
     kept_out: dict[int, int]  # trains that are due and cannot enter: because of whom
     view: View | None  # None: nobody asks
+    turns: tuple[Turn, ...] = ()  # trains that turn with the coming step
 
 
 def nothing(trains: int) -> Around:
@@ -103,8 +107,7 @@ class Traffic:
         self.settles = float(np.max(supervisor.settles(p.assumed, p.assumed.braking), initial=0.0))
         self.ways: Ways | None = None
         self._limits(0.0)
-        routes = [[p.line.index[e] for e in route] for route in p.roster.routes]
-        self.first_ways, self.stops = laid(routes, p.line.start_m, p.line.length_m), list(p.roster.stops)
+        self.turns, self.stopping, self.stops = Turns(p, self.net, journal), stopping(p), list(p.roster.stops)
 
     def initial(self) -> State:
         """Before the run: trains that are placed have come."""
@@ -113,7 +116,8 @@ class Traffic:
             came=np.full(n, self.roster.placed), entering=np.zeros(n, bool), left=np.zeros(n, bool),
             next_stop=np.zeros(n, np.int64), stands_since=np.full(n, np.nan), stands_until=np.full(n, np.nan),
             late=np.full(n, np.nan), stopping=np.zeros(n, bool), parked=np.zeros(n, bool),
-            waits_for=np.full(n, -1), kept_out=np.full(n, -1), requests=interlocking.none(),
+            waits_for=np.full(n, -1), kept_out=np.full(n, -1), leg=np.zeros(n, np.int64), turns_since=np.full(n, np.nan),
+            kept_back=np.full(n, -1), requests=interlocking.none(),
         )  # fmt: skip
 
     def step(
@@ -129,23 +133,40 @@ class Traffic:
         if not self.looks:
             return s, nothing(len(speed))
         self._limits(t)
-        if self.ways is not ways and self.stops_of.any():  # they changed: the places of stops count along them
-            self.stops = [
-                tuple(stop._replace(place=moved(self.first_ways, ways, i, stop.place)) for stop in stops)
-                for i, stops in enumerate(self.roster.stops)
-            ]
+        self._take_over(ways, s)
+        stood = s.standing & seen.present
         for i in [] if s.came.all() else np.flatnonzero(~s.came & self._given_up(t) & ~self._given_up(t - self.step_s)).tolist():
             self.journal.event(t, "given_up", train=self.p.scenario.ids[i], planned_s=float(self.roster.depart[i]))
         s, stops, soon = self._stops(t, seen, speed, overrun, s)
-        later = t + self.step_s
         if last:
             self._uncalled(s)
-        asking, reach = [] if last else [*self._returning(later, s), *self.due(later, s)], self._reach(speed)
+        later = t + self.step_s
+        parked = s.parked & ~self.roster.driven & (s.stands_until <= later + 1e-9)  # who come back
+        asking, reach = [] if last else [*np.flatnonzero(parked).tolist(), *self.due(later, s)], self._reach(speed)
         s, held, entries, kept_out = self.entering(t, ways, s.on_track(seen), speed, s, asking, reach, red, self.step_s)
         present = s.on_track(seen).present.copy()
         present[[i for i, _ in entries]] = True
-        view = self._look(ways, seen._replace(present=present), speed, held, s, self._reach(speed) if entries else reach)
-        return s, Around(entries, stops, soon, held, kept_out, view)
+        reach = self._reach(speed) if entries else reach
+        view = self.turns.ends(self._look(ways, seen._replace(present=present), speed, held, s, reach), seen, overrun)
+        ordered = None if self.p.obeys else lambda there, rows: self._ordered(t, there, seen._replace(row=rows), s)
+        asks, known = np.flatnonzero(stood & ~np.isnan(s.turns_since) & (not last)).tolist(), (s.leg, s.turns_since, s.kept_back)
+        requests, now, turns = self.turns.step(t, asks, ways, s.on_track(seen), reach, s.standing, s.requests, known, ordered)
+        s = s._replace(requests=requests, leg=now[0], turns_since=now[1], kept_back=now[2])
+        return s, Around(entries, stops, soon, held, kept_out, view, turns)
+
+    def _take_over(self, ways: Ways, s: State) -> None:
+        """Work out what follows from the ways trains have now, where they changed: zones, and the places of stops and turns."""
+        if self.ways is ways:
+            return
+        self.ways, self.zones = ways, zones.of(ways, self.net, self.turns.later)
+        if self.turns.any:
+            self.turns.changed(ways, s.leg)
+        if self.stops_of.any():
+            begun = self.turns.begun(s.leg)
+            self.stops = [
+                tuple(one._replace(place=moved(begun, ways, i, one.place)) if one.leg == s.leg[i] else one for one in stops)
+                for i, stops in enumerate(self.roster.stops)
+            ]
 
     # Arrivals and entries
 
@@ -197,6 +218,7 @@ class Traffic:
 
         They are there ``after`` so many seconds.
         """
+        self._take_over(ways, s)
         asking = np.zeros(len(speed), bool)
         asking[due] = True
         stands = (s.kept_out >= 0) & (np.abs(speed[s.kept_out]) < STANDS_MPS)  # who stands may wait for it in turn
@@ -245,6 +267,8 @@ class Traffic:
         if (stop := self.stop_of(i, s)) is not None:
             place = stop.place - float(self.p.rails.start_m[roster.edge[i]]) - float(roster.lane_position[i])
             rooms.append(place + self._further(stop, i))
+        if np.isfinite(last := self.turns.last_place(i)):
+            rooms.append(last - float(self.p.rails.start_m[roster.edge[i]] + roster.lane_position[i]))
         for room in rooms if self.p.obeys else rooms[1:]:
             planned = float(min(rules.service_mps2, self.assumed.braking[i]))
             left = np.array([min(room, FAR_M) - wanted * self.step_s])
@@ -290,11 +314,6 @@ class Traffic:
         )
         return bool(np.any(seen.emergency[view.targets.train[behind]]))
 
-    def _returning(self, t: float, s: State) -> list[int]:
-        """Trains that are parked and may go on."""
-        back: list[int] = np.flatnonzero(s.parked & ~self.roster.driven & (s.stands_until <= t + 1e-9)).tolist()
-        return back
-
     def _may_return(self, i: int, speed: Floats, view: View) -> bool:
         """Whether a parked train finds its place on the track free; ``view`` has it there."""
         ahead = authority.of(view.targets, (view.targets.train == i) & (view.targets.other >= 0))
@@ -305,9 +324,9 @@ class Traffic:
     # Stops
 
     def stop_of(self, i: int, s: State) -> Stop | None:
-        """The next stop of a train."""
+        """The next stop of a train before it turns or leaves."""
         stops, k = self.stops[i], int(s.next_stop[i])
-        return stops[k] if k < len(stops) else None
+        return stops[k] if k < len(stops) and stops[k].leg <= s.leg[i] else None
 
     def _full(self, stop: Stop, s: State) -> bool:
         """Whether a train that is to park at a stop finds no place."""
@@ -322,15 +341,14 @@ class Traffic:
 
     def _further(self, stop: Stop, i: int) -> float:
         """How far behind a stop a train would come to a stand that passes it as fast as it may [m]; 0 if it is to stand there."""
-        rate = np.minimum(self.rules.service_mps2, self.assumed.braking[i])
-        return float(supervisor.stopping_distance(np.array([stop.passing]), rate, self.step_s, self.theta)[0])
+        return float(self.stopping(np.array([i]), np.array([stop.passing]))[0])
 
     def _stops(self, t: float, seen: Seen, speed: Floats, overrun: Floats, s: State) -> tuple[State, tuple[Ints, Floats], Bools]:
         """Arrive at and leave stops; the trains that have one ahead and the room to it [m], and who stops soon."""
         trains, rooms, n = [], [], len(speed)
-        if not self.stops_of.any():
+        if not (self.stops_of.any() or self.turns.any):
             return s, nothing(n).stops, np.zeros(n, bool)
-        standing = s.standing
+        standing = ~np.isnan(s.stands_until)
         s = s._replace(
             next_stop=s.next_stop.copy(), stands_since=s.stands_since.copy(), stands_until=s.stands_until.copy(),
             late=s.late.copy(), stopping=s.stopping.copy(), parked=s.parked.copy(),
@@ -376,9 +394,15 @@ class Traffic:
                 continue
             trains.append(i)
             rooms.append(max(room - float(overrun[i]), 0.0) + self._further(stop, i))
+        if self.turns.yards:
+            free = np.array([self.stop_of(i, s) is None for i in range(n)])
+            stand, ahead = self.turns.wanted(seen, speed, free, ~np.isnan(s.turns_since), self.stopping, STANDS_MPS)
+            s = s._replace(turns_since=s.turns_since.copy())
+            s.turns_since[[i for i in stand if np.isnan(s.turns_since[i])]] = t
+            trains += [i for i, _ in ahead]
+            rooms += [max(room - float(overrun[i]), 0.0) for i, room in ahead]
         found, room_to = np.array(trains, np.int64), np.array(rooms)
-        rate = np.minimum(self.rules.service_mps2, self.assumed.braking[found])
-        braking = supervisor.stopping_distance(speed[found], rate, self.step_s, self.theta)
+        braking = self.stopping(found, speed[found])
         near, soon = np.zeros(n, bool), np.zeros(n, bool)
         near[found] = room_to < braking + 10.0 * self.step_s * speed[found] + 50.0
         soon[found] = room_to < braking + SOON_S * speed[found]
@@ -443,12 +467,10 @@ class Traffic:
         self, t: float, ways: Ways, seen: Seen, reach: Floats, entering: Bools, keeps: Bools, s: State
     ) -> tuple[State, Held]:
         """Let every train request what lies within its reach; ``entering`` (n,) are those that ask to enter the net."""
-        if self.ways is not ways:  # they changed
-            self.ways, self.zones = ways, zones.of(ways, self.net)
         requests, held, said = interlocking.request(
             self.zones, s.requests, seen.row, seen.position, self.length, seen.present, reach,
             self.p.supervision.margin_m + DRIVER_MARGIN_M, entering, self._own_stops(s), s.standing,
-            self._ordered(t, ways, seen, s), keeps,
+            self._ordered(t, ways, seen, s), keeps, self.turns.back(s.leg),
         )  # fmt: skip
         ids, edges = self.p.scenario.ids, self.p.rails.edges
         for one in said:

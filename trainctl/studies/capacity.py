@@ -19,6 +19,7 @@ SUMO). Its table of running resistance is fitted by a Davis form within 0.33 kN 
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -83,6 +84,14 @@ BAND_MPS = 0.5
 SPARE_S = 120.0
 
 
+class Found(NamedTuple):
+    """The smallest safe spacing of a row, from `trainctl compare spacing`."""
+
+    row: str
+    spacing_m: float
+    braking_mps2: tuple[float, float]  # full braking of the worst and of the best brakes
+
+
 class CapacityPlan(NamedTuple):
     """What is compared."""
 
@@ -95,11 +104,22 @@ class CapacityPlan(NamedTuple):
     position_error_m: float = 20.0  # of the formation at the start, uniform, either way
     speed_error_mps: float = 0.3
     seed: int = 1
+    found: tuple[Found, ...] = ()  # rows whose formations keep the smallest safe spacing instead
+
+    def found_of(self, row: str) -> Found | None:
+        """What was found for a row, None if nothing was."""
+        return next((found for found in self.found if found.row == row), None)
+
+    def spacing_of(self, row: str) -> float:
+        """Spacing of a row's formation [m]."""
+        found = self.found_of(row)
+        return self.spacing_m if found is None else found.spacing_m
 
     @property
     def begin_m(self) -> float:
         """Where the stretch begins: the formation stands before it. At a signal."""
-        lead_in = (self.trains - 1) * self.spacing_m + 2.0 * self.position_error_m + 1000.0
+        widest = max([self.spacing_m, *(found.spacing_m for found in self.found)])
+        lead_in = (self.trains - 1) * widest + 2.0 * self.position_error_m + 1000.0
         return math.ceil(lead_in / self.signals_m) * self.signals_m
 
     @property
@@ -123,15 +143,15 @@ def line(plan: CapacityPlan) -> dict[str, Any]:
 
 def scenario(plan: CapacityPlan, row: str) -> dict[str, Any]:
     """Tables of a row's scenario, but for ``network``."""
-    n = plan.trains
+    n, spacing = plan.trains, plan.spacing_of(row)
     errors = np.random.default_rng(plan.seed).uniform(-1.0, 1.0, (n, 2)) * (plan.position_error_m, plan.speed_error_mps)
     first = plan.begin_m - 2.0 * plan.position_error_m
     trains = [
-        {"id": i + 1, "type": "ice3", "track": 1, "position_m": first - i * plan.spacing_m + float(errors[i, 0]),
+        {"id": i + 1, "type": "ice3", "track": 1, "position_m": first - i * spacing + float(errors[i, 0]),
          "speed_mps": plan.cruise_mps + float(errors[i, 1])}
         for i in range(n)
     ]  # fmt: skip
-    way = (n - 1) * plan.spacing_m + plan.length_m
+    way = (n - 1) * spacing + plan.length_m
     tables: dict[str, Any] = {
         "schema_version": 1,
         "title": f"{n} trains over {plan.length_m / 1000:g} km: {row.replace('_', ' ')}",
@@ -139,7 +159,7 @@ def scenario(plan: CapacityPlan, row: str) -> dict[str, Any]:
         "plant": {"kind": "coupled_units"},
         "reference": {"speed_mps": plan.cruise_mps, "position_m": first},
         "bounds": {"speed_upper_mps": plan.speed_mps},
-        "topology": {"spacing_m": plan.spacing_m, "lower_m": 0.5 * plan.spacing_m, "upper_m": 1.5 * plan.spacing_m},
+        "topology": {"spacing_m": spacing, "lower_m": 0.5 * spacing, "upper_m": 1.5 * spacing},
         "train_type": {"ice3": ICE3},
         "train": trains,
     }
@@ -147,6 +167,9 @@ def scenario(plan: CapacityPlan, row: str) -> dict[str, Any]:
         return {**tables, **_sumo(plan, row, tables)}
     law = LAW_ROWS[row]
     tables["controller"] = {"law": law.__name__.rpartition(".")[2], **law.COMPARED[row]}
+    found = plan.found_of(row)
+    if found is not None and hasattr(law, "in_stops"):  # with the gains it was found with
+        return {**tables, **law.in_stops(tables, _band(plan), found.braking_mps2)}
     return {**tables, **law.on_a_line(tables, _band(plan))}
 
 
@@ -179,6 +202,27 @@ def sumo_duration(plan: CapacityPlan) -> float:
 def _band(plan: CapacityPlan) -> dict[str, float]:
     """Speed bounds for the laws that have both."""
     return {"speed_lower_mps": plan.cruise_mps - BAND_MPS, "speed_upper_mps": plan.speed_mps}
+
+
+def found_in(file: Path) -> tuple[Found, ...]:
+    """The spacings that `trainctl compare spacing` wrote into ``file``, its ``spacing.json``.
+
+    Raises
+    ------
+    InputError
+        No such file, or not one of these.
+    """
+    from trainctl.studies.stops import StopsPlan
+
+    try:
+        told = json.loads(file.read_text(encoding="utf-8"))
+        braking = StopsPlan(**told["plan"]).braking
+        rows = [(str(row["row"]), row["spacing_m"]) for row in told["rows"]]
+        return tuple(Found(row, float(spacing), braking) for row, spacing in rows if spacing is not None)
+    except OSError as error:
+        raise InputError(f"--spacings {file}: {error.strerror}") from None
+    except (ValueError, TypeError, KeyError):
+        raise InputError(f"--spacings {file}: must be a spacing.json of `trainctl compare spacing`") from None
 
 
 # What is measured
@@ -410,7 +454,7 @@ def ideal(plan: CapacityPlan, row: str) -> dict[str, float]:
     """What a row could reach at best, by the keys of ``PANELS``."""
     own = row in SUMO_ROWS
     speed = plan.speed_mps if own else plan.cruise_mps
-    headway = headway_bound(plan, row.partition("_")[0]) if own else plan.spacing_m / speed
+    headway = headway_bound(plan, row.partition("_")[0]) if own else plan.spacing_of(row) / speed
     force = ICE3["unit_mass_kg"] * sum(ICE3[key] * speed**k for k, key in enumerate(DAVIS))
     return {
         "headway_s": headway, "trains_per_hour": 3600.0 / headway, "journey_time_s": plan.length_m / speed,

@@ -16,8 +16,8 @@ from trainctl.figures import style
 from trainctl.figures.overlay import QUANTITIES, overlay
 from trainctl.figures.trains import drawable
 from trainctl.laws import compared, find_law, find_plant, plants_of
-from trainctl.metrics.run import DEFINITIONS, metrics
-from trainctl.metrics.values import Values
+from trainctl.metrics.run import DEFINITIONS
+from trainctl.metrics.versions import current
 from trainctl.runs.run import Run
 
 #: Rows of the table, as far as they apply to any of the runs.
@@ -35,15 +35,11 @@ ROWS = (
 
 def table(runs: Sequence[Run]) -> list[dict[str, Any]]:
     """One row per metric: ``metric, unit, values`` (one per run, None where it does not apply)."""
-    columns = [_values(run) for run in runs]
+    columns = [current(run) for run in runs]
     return [
         {"metric": name, "unit": DEFINITIONS.get(name, ("", ""))[0], "values": [column.get(name) for column in columns]}
         for name in ROWS if any(name in column for column in columns)
     ]  # fmt: skip
-
-
-def _values(run: Run) -> Values:
-    return run.metrics if (run.folder / "metrics.json").exists() else metrics(run)
 
 
 def names(runs: Sequence[Run]) -> list[str]:

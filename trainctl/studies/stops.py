@@ -90,6 +90,11 @@ class StopsPlan(NamedTuple):
         return self.brakes_mps2 * (1.0 + self.brake_scatter)
 
     @property
+    def braking(self) -> tuple[float, float]:
+        """Full braking of the worst and of the best brakes [m/s2]."""
+        return self.sure_mps2, self.best_mps2
+
+    @property
     def duration_s(self) -> float:
         """A stop is over by then."""
         return math.ceil(self.brakes_s + 2.0 * self.speed_mps / self.sure_mps2 + 60.0)
@@ -104,8 +109,11 @@ def line(plan: StopsPlan, spacing: float, stops: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def scenario(plan: StopsPlan, row: str, spacing: float, stops: Sequence[int]) -> dict[str, Any]:
-    """Tables of a row's scenario of these stops, by their numbers, but for ``network``."""
+def scenario(plan: StopsPlan, row: str, spacing: float, stops: Sequence[int], slowest: float = 0.0) -> dict[str, Any]:
+    """Tables of a row's scenario of these stops, by their numbers, but for ``network``.
+
+    ``slowest`` [m/s] is the minimum speed that laws with bounds of speed are told.
+    """
     first = plan.trains * spacing + 5000.0
     trains, types, events, percent = [], {}, [], []
     for track, k in enumerate(stops):
@@ -135,10 +143,8 @@ def scenario(plan: StopsPlan, row: str, spacing: float, stops: Sequence[int]) ->
         "controller": {"law": law.__name__.rpartition(".")[2], **law.COMPARED[row]},
         "train_type": types, "train": trains, "event": events,
     }  # fmt: skip
-    band = {"speed_lower_mps": 0.0, "speed_upper_mps": plan.line_mps}
-    tables |= (
-        law.in_stops(tables, band, (plan.sure_mps2, plan.best_mps2)) if hasattr(law, "in_stops") else law.on_a_line(tables, band)
-    )
+    band = {"speed_lower_mps": slowest, "speed_upper_mps": plan.line_mps}
+    tables |= law.in_stops(tables, band, plan.braking) if hasattr(law, "in_stops") else law.on_a_line(tables, band)
     period = tables["run"].get("control_period_s", 1.0)
     tables["topology"] = {**tables["topology"], "delay_s": math.ceil(plan.delay_s / period) * period}
     if plan.bad_s > 0.0:
@@ -175,7 +181,7 @@ class Outcome(NamedTuple):
         }
 
 
-class _Silent:
+class Silent:
     """A journal that keeps nothing."""
 
     def event(self, time: float, kind: str, **fields: Any) -> None:
@@ -205,7 +211,7 @@ def stopped(plan: StopsPlan, row: str, spacing: float, stops: Sequence[int], fol
         p = prepared(plan, row, spacing, stops, folder)
     except InputError as error:
         return Outcome(spacing, REFUSED, 0, len(stops), 0, math.inf, error.mistakes[0].partition(": ")[2]), None
-    loop = Loop(p, Numeric(p.line), cast("Journal", _Silent()))
+    loop = Loop(p, Numeric(p.line), cast("Journal", Silent()))
     watch = _Watch(plan, p, len(stops))
     try:
         while not loop.over and not watch.over(loop):
@@ -261,7 +267,7 @@ def reference_lines(plan: StopsPlan) -> dict[str, float]:
     hard as the worst. The distances are those of ``railway.supervisor``, in steps of 1 s.
     """
     v, step = np.array([plan.speed_mps]), 1.0
-    ways = [float(stopping_distance(v, b, step, 0.5)[0]) for b in (plan.sure_mps2, plan.best_mps2)]
+    ways = [float(stopping_distance(v, b, step, 0.5)[0]) for b in plan.braking]
     other = ICE3["unit_length_m"] + 20.0 + plan.speed_mps * (plan.delay_s + step)
     return {"absolute": ways[0] + other, "relative": ways[0] - ways[1] + other}
 

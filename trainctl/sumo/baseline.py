@@ -53,7 +53,7 @@ class Baseline(Session):
         self.number = {name: i for i, name in enumerate(self.ids)}
         self.length = p.consists.train_length()
         self.track = np.array([line.track_ids.index(t) for t in line.tracks], np.int64)
-        routes = [d.route for d in self.departures] if p.placed else p.roster.routes
+        routes = [d.route for d in self.departures] if p.placed else p.roster.whole_routes
         self.ways = ways([[line.index[e] for e in route] for route in routes], line.start_m, line.length_m)
         row, there = self.ways.first[:-1].copy(), np.zeros(len(self.ids), bool)
         position = self.ways.begin[row] + (

@@ -49,6 +49,10 @@ def replay(run: Run, binary: str = "sumo-gui", from_s: float = 0.0, delay_ms: fl
     SimulatorError
         SUMO could not be started, or the window was closed.
     """
+    if turned := sorted({str(event["train"]) for event in run.events if event["kind"] == "turn"}):
+        raise InputError(
+            f"{run.folder}: trains turn back in it ({', '.join(turned[:8])}), which is not shown again: watch a run with --gui"
+        )
     scenario, _ = examine(run.scenario, resolved=True)
     if scenario is None:
         raise InputError(f"{run.folder}: its scenario.toml is damaged")

@@ -7,8 +7,7 @@ import os
 import re
 import sys
 from collections import deque
-from collections.abc import Container, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +17,13 @@ import numpy as np
 from sumo_net import Line
 from trainctl.errors import CouplingError, SimulatorError
 from trainctl.numeric import LEAVES_M, lay_out, way_lengths
-from trainctl.railway.ways import Ways, rerouted
+from trainctl.railway.turning import inside
+from trainctl.railway.ways import Ways, rerouted, turned
 from trainctl.runs.sumo_logs import elements
 from trainctl.signals import Bools, Floats, Ints, Links, Seen, Start
 from trainctl.sumo.causes import SPEED_MODE_FREE, cause
 from trainctl.sumo.commanded_files import LOGS, arrival_word, normal, write_configuration, write_routes
+from trainctl.sumo.idling import OF_IDLING, idle_s, silent
 from trainctl.sumo.preflight import objections
 from trainctl.sumo.signal_box import Box, Obeyed
 from trainctl.traffic.trial import tried_as_a_whole
@@ -33,18 +34,15 @@ TOLERANCE_M = 1e-6
 #: Closer than this to the end of its edge a train may be on the next one.
 NEAR_M = 1e-3
 
-#: SUMO's driver decides that often [s]: never, but where it is told to. Every train is commanded in every step, so all it decides
-#: is overruled, and it takes half of SUMO's time. Only its way over the end of an edge has to be planned.
-IDLE_S = 1e6
-
 #: Closer than this to the end of its edge, or beyond, SUMO plans the step.
 PLANNED_M = 1.0
 
 #: A stop that a train parks at, until it is told to resume: its time [s], and the flag that says so.
 PARKS_S, PARKING = 1e6, 1
 
-#: What SUMO says about drivers who decide so rarely.
-OF_IDLING = ("Warning: Given action step length", "Warning: Action step length")
+#: SUMO puts a train that turns so far beyond its place [m], and by the junctions under it; told to go as far before it turns, it
+#: stands where it should.
+TURNS_M = 1e-3
 
 
 def messages(log: Path) -> list[tuple[float | None, str]]:
@@ -147,7 +145,7 @@ class Session:
 class Sumo(Session):
     """SUMO behind the loop: trains move by what they are told."""
 
-    idle = True  # see IDLE_S; not where signals are obeyed
+    idle = True  # see ``idling``; not where signals are obeyed
     box: Box | None = None
 
     def __init__(
@@ -174,7 +172,10 @@ class Sumo(Session):
         self._plan = _direct(vehicle.setActionStepLength)
         self.ids, self.routes, self.departs_m = list(start.ids), list(start.routes), start.lane_position
         self.ways = lay_out(self.line, start)
-        self.arrival = np.full(len(self.ids), np.inf) if start.arrival is None else start.arrival
+        self.arrival = np.full(len(self.ids), np.inf) if start.arrival is None else start.arrival.copy()
+        self.length = start.length
+        self.turning: list[tuple[int, tuple[str, ...], float]] = []
+        self.taken_off: set[int] = set()
         self.way_end = self._way_end()
         self.coming: list[tuple[int, float]] = []
         self.pending: dict[int, float] = {}
@@ -325,6 +326,11 @@ class Sumo(Session):
             startPos=max(place - 1.0, 0.0),
         )  # fmt: skip
 
+    def turn(self, train: int, edges: tuple[str, ...], arrival: float) -> None:
+        """Let a train turn back with the next ``move``: SUMO does as soon as the route says so, so it has not until now."""
+        self._call(self.api.vehicle.setRoute, self.ids[train], [self.line.edges[self.seen.edge[train]], *normal(edges)])
+        self.turning.append((train, edges, arrival))
+
     def linked(self, links: Links, formation: Ints) -> None:
         """Nobody looks."""
 
@@ -333,8 +339,11 @@ class Sumo(Session):
         before, row, present = self.seen.position, self.seen.row, self.seen.present
         wanted = np.where(present, before + displacement, before)
         left = self.ways.begin[row] + self.line.length_m[self.ways.edge[row]] - wanted
+        speeds = displacement / step
+        for train, edges, _ in self.turning:
+            speeds[train] = (TURNS_M + self._inside(train, edges)) / step
         ours = present if self.box is None else present & ~self.box.obeyed.driven
-        self._call(self._command, np.flatnonzero(ours), displacement / step)
+        self._call(self._command, np.flatnonzero(ours), speeds)
         if self.idle:
             for i in np.flatnonzero(present & (left < PLANNED_M)).tolist():
                 self._call(self._plan, self.ids[i], 0.0)
@@ -342,6 +351,9 @@ class Sumo(Session):
             self._call(self.api.vehicle.remove, self.ids[i])
             del self.pending[i]
         self._call(self.api.simulationStep)
+        for train, edges, arrival in self.turning:
+            wanted[train], left[train] = self._turned(train, edges, arrival)
+        self.turning.clear()
         own = None
         if self.box is not None:
             own, present = self.box.read(), present & ~self.box.obeyed.driven
@@ -358,11 +370,36 @@ class Sumo(Session):
             now.present[self._verify_insertion()] = True
         self.seen = now if own is None else own.within(now, self.ways)
 
+    def _inside(self, train: int, edges: tuple[str, ...]) -> float:
+        """Length of the junctions under a train once it has turned [m]."""
+        size, row = self.line.length_m, int(self.seen.row[train])
+        front = float(self.ways.begin[row] + size[self.ways.edge[row]] - self.seen.position[train] + self.length[train])
+        numbers, within = [self.line.index[edge] for edge in edges], [edge.startswith(":") for edge in self.line.edges]
+        return inside(np.array(numbers, np.int64), front, np.array(within), size)
+
+    def _turned(self, train: int, edges: tuple[str, ...], arrival: float) -> tuple[float, float]:
+        """Take over the way of a train that has turned: where its front should be now, and how far that is from its edge's end."""
+        line, rows, before, onward = self.line, self.seen.row, self.ways.first, [self.line.index[e] for e in edges]
+        front, length = float(self.seen.position[train]), float(self.length[train])
+        self.ways, row, place = turned(self.ways, train, int(rows[train]), front, length, onward, line.start_m, line.length_m)
+        rows = rows + self.ways.first[:-1] - before[:-1]
+        rows[train] = row
+        self.seen = self.seen._replace(row=rows)
+        self.arrival[train] = arrival
+        self.way_end = self._way_end()
+        if math.isfinite(arrival):  # SUMO takes a place of arrival for that of any route, so it knows of none
+            self.taken_off.add(train)
+        return float(self.ways.begin[row]) + place, float(line.length_m[self.ways.edge[row]]) - place
+
     def _left(self, wanted: Floats, present: Bools) -> Bools:
         """Which trains have left the net at the end of their way."""
         near = present & (wanted > self.way_end - LEAVES_M - TOLERANCE_M)
         if near.any():
             gone = set(self.api.simulation.getArrivedIDList())
+            for i in self.taken_off.intersection(np.flatnonzero(near & (wanted > self.way_end - LEAVES_M)).tolist()):
+                if self.ids[i] not in gone:
+                    self._call(self.api.vehicle.remove, self.ids[i], self.api.constants.REMOVE_ARRIVED)
+                    gone.add(self.ids[i])
             near &= np.array([name in gone for name in self.ids])
         return near
 
@@ -394,24 +431,6 @@ def _direct(function: Any) -> Any:
     """Find the compiled function that a function of libsumo hands its arguments on to: handing on takes a third of a call."""
     compiled = getattr(sys.modules.get(function.__module__), "_libsumo", None)
     return getattr(compiled, f"vehicle_{function.__name__}", function)
-
-
-def idle_s(step: float) -> float:
-    """``IDLE_S`` in whole steps of the simulator: SUMO rounds anything else, and says so."""
-    return round(math.ceil(IDLE_S / step) * step, 3)
-
-
-@contextmanager
-def silent() -> Iterator[None]:
-    """What libsumo prints on stderr meanwhile goes nowhere; it stands in SUMO's message log, too."""
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
 
 
 def _ended(path: Path) -> bool:

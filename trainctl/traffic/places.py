@@ -9,6 +9,7 @@ from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 from sumo_net.netfile import NetFile, for_trains, read_net
+from sumo_net.rails import directions
 from sumo_net.spec import LineError
 from trainctl.errors import InputError
 from trainctl.traffic.files import PLACES, Elements, bad_number, bad_time, is_number, is_time, seconds
@@ -29,6 +30,7 @@ class Tracks(NamedTuple):
     onward: dict[str, set[str]]  # from each edge
     file: NetFile
     marked: bool  # it has lanes that allow a rail class by name
+    twin: dict[str, str]  # the same track in the other direction, of every edge; "": none
 
 
 class Place(NamedTuple):
@@ -75,7 +77,7 @@ def read_tracks(net: Path) -> Tracks:
             onward.setdefault(c["from"], set()).add(c["to"])
     except (KeyError, ValueError) as error:
         raise InputError(f"{net}: not a SUMO net: a lane or a connection has no {error}") from None
-    return Tracks(length, speed, onward, file, any(for_trains(lane) for edge in normal for lane in edge.lanes))
+    return Tracks(length, speed, onward, file, any(for_trains(lane) for edge in normal for lane in edge.lanes), directions(file))
 
 
 def unmarked(edges: Iterable[str], tracks: Tracks) -> list[str]:
@@ -133,7 +135,11 @@ def unconnected(edges: list[str], tracks: Tracks) -> list[str]:
     """Mistakes in a route: edges that are not in the net, else those that do not follow each other there."""
     unknown = [f"edge {e}: not in the net" for e in edges if e not in tracks.onward]
     return unknown or [
-        f"its route is not connected: no way from edge {a} to edge {b}" for a, b in pairwise(edges) if b not in tracks.onward[a]
+        f"cannot turn back from edge {a} to edge {b}: the net has no connection there"
+        if tracks.twin.get(a) == b
+        else f"its route is not connected: no way from edge {a} to edge {b}"
+        for a, b in pairwise(edges)
+        if b not in tracks.onward[a]
     ]
 
 

@@ -161,7 +161,7 @@ def test_lines_are_named_beside_their_ends_and_never_on_each_other(tmp_path: Pat
     shown = figure(made_up(tmp_path, "fully_distributed", trains=6), "speeds")  # all end at the same speed
     labels = [text for text in shown.axes[0].texts if text.get_text().startswith("train ")]
     assert [text.get_text() for text in labels] == [f"train {k}" for k in range(6, 0, -1)]
-    assert np.diff([text.xy[1] for text in labels]).min() > 0.9 * style.LINE_SHARE
+    assert np.diff([text.xy[1] for text in labels]).min() > 0.9 * style.line_share(shown.axes[0])
     assert not any(text.get_text().startswith("train") for found in shown.legends for text in found.get_texts())
 
 

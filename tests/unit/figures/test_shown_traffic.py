@@ -21,7 +21,9 @@ from trainctl.figures.corridors import corridors
 from trainctl.figures.train_graph import MARKS
 from trainctl.figures.trains import drawable
 from trainctl.report.animation import animation
+from trainctl.report.film import film
 from trainctl.report.page import page
+from trainctl.report.panels import panels
 from trainctl.runner import run
 from trainctl.runs.known import facts
 from trainctl.runs.run import Run
@@ -77,7 +79,8 @@ def test_no_line_where_a_train_is_not_there_and_marks_where_something_happened(m
 
 
 def test_two_branches_are_two_corridors_and_places_have_their_names(merging):
-    west, south = corridors(merging, drawable(merging).trains)
+    (west, south), left_out = corridors(merging, drawable(merging).trains)
+    assert left_out == ""
     assert (west.name, south.name) == ("from_west to to_east", "from_south to to_north")
     assert {place.name: place.kind for place in west.places} == {"junction": "junction", "trunk": "stop", "fork": "junction"}
     at = {place.name: place.at_m for place in west.places}
@@ -107,6 +110,44 @@ def test_planned_times_stand_beside_actual_ones(merging, tmp_path):
     assert "+60 s" in {text.get_text() for text in panel.texts}
 
 
+def test_stations_that_no_train_reached_are_named_in_figure_page_and_map(merging, tmp_path, monkeypatch):
+    folder = tmp_path / "unreached"
+    shutil.copytree(merging.folder, folder)
+    pd.DataFrame({
+        "train": ["stopping", "stopping"], "stop": ["trunk", "Far"], "platform": ["trunk", "to_east"], "number": [1, 2],
+        **{key: np.full(2, np.nan) for key in ("planned_arrival_s", "planned_departure_s", "departure_s", "delay_s")},
+        "arrival_s": [650.0, np.nan],
+    }).to_parquet(folder / "stops.parquet")  # fmt: skip
+    run = Run(folder)
+    (west, south), _ = corridors(run, drawable(run).trains)
+    kinds = {place.name: (place.kind, place.at_m) for place in west.places}
+    assert kinds["trunk"][0] == "stop" and kinds["Far"][0] == "unreached" and "Far" not in {p.name for p in south.places}
+    assert kinds["Far"][1] == pytest.approx(kinds["fork"][1] + 4000.0, abs=60.0)  # to_east has 8 km
+    shown = catalogue.figure(run, "train_graph")
+    assert "Far" in {text.get_text() for text in shown.axes[0].texts}
+    assert "stop that no train reached" in {text.get_text() for text in shown.legends[0].get_texts()}
+    monkeypatch.setattr("trainctl.figures.corridors.NEAR", 0.05)
+    (west, _), _ = corridors(run, drawable(run).trains)
+    assert west.beyond == ("Far",) and "Far" not in {place.name for place in west.places}
+    assert catalogue.figure(run, "train_graph").axes[0].get_title(loc="right") == "no train came near Far"
+    assert next(p for p in panels(drawable(run)) if p["id"] == "graph")["note"].endswith("No train came near Far.")
+    monkeypatch.undo()
+    graph = next(p for p in panels(drawable(run)) if p["id"] == "graph")
+    assert "Far (no train came)" in {place["name"] for place in graph["places"]}
+    stops = {stop["name"]: stop for stop in animation(drawable(run))["stops"]}
+    assert [stops[name]["reached"] for name in ("trunk", "Far")] == [True, False]
+    assert abs(stops["trunk"]["x"] - 15900.0) < 20.0
+
+
+def test_corridors_that_are_not_shown_are_counted(merging, monkeypatch):
+    monkeypatch.setattr("trainctl.figures.corridors.MOST", 1)
+    _, left_out = corridors(merging, drawable(merging).trains)
+    assert left_out == "1 more corridor is not shown, whose trains stand in these"
+    assert catalogue.figure(merging, "train_graph").axes[-1].get_title(loc="right") == left_out
+    graph = next(p for p in panels(drawable(merging)) if p["id"] == "graph")
+    assert graph["note"].endswith("1 more corridor is not shown, whose trains stand in these.")
+
+
 def test_the_page_shows_the_net_as_it_lies(merging):
     film = animation(drawable(merging))
     frames, trains = len(film["time"]), len(film["trains"])
@@ -121,8 +162,10 @@ def test_the_page_shows_the_net_as_it_lies(merging):
     assert "On the net" in text and "There is no animation" not in text and "{{" not in text.partition("<script>")[0]
 
 
-def test_a_run_without_sumo_has_a_page_without_animation(numeric):
+def test_a_run_without_sumo_has_a_page_without_animation(numeric, tmp_path):
     assert animation(drawable(numeric))["time"] == []
+    with pytest.raises(InputError, match="nothing to draw the trains on"):
+        film(numeric, tmp_path / "film.gif")
     text = page(numeric)
     assert "There is no animation: a run without SUMO" in text
     assert "<div hidden>" in text
@@ -138,6 +181,7 @@ def test_commands_work_on_such_runs(merging, numeric, tmp_path, monkeypatch, cap
         monkeypatch, capsys, "compare", merging.folder, numeric.folder, "--out", tmp_path / "compare", "--json"
     ))  # fmt: skip
     assert len(found["figures"]) == 4
+    assert typed(monkeypatch, capsys, "film", merging.folder, "--out", tmp_path / "film.gif", "--seconds", "0.3").strip()
     for form in ("csv", "mat"):
         assert typed(monkeypatch, capsys, "export", merging.folder, "--format", form, "--out", tmp_path / form)
     assert "in_formation" in (tmp_path / "csv" / "trains.csv").read_text().partition("\n")[0]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gzip
+import json
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from trainctl.errors import InputError
 from trainctl.metrics.run import DEFINITIONS, metrics
 from trainctl.metrics.traffic import metrics_of_fcd
 from trainctl.metrics.values import base
+from trainctl.metrics.versions import CHANGES, VERSION, current
 from trainctl.record.folder import about_run, write_info
 from trainctl.record.recorder import Recorder, standard_tables
 from trainctl.runs.run import Run
@@ -396,3 +399,19 @@ def test_a_broken_scenario_is_one_line(tmp_path: Path) -> None:
     run = run_folder(tmp_path, three_trains(), {"train": [{"type": "t"}]})
     with pytest.raises(InputError, match=r"scenario\.toml: not a resolved scenario"):
         metrics(run)
+
+
+def test_metrics_say_by_which_definitions_they_were_computed(finished: Any, tmp_path: Path) -> None:
+    done = finished("fully_distributed", "numeric", **{"run.duration_s": 60})
+    stored = json.loads((done.folder / "metrics.json").read_text())
+    assert stored["definitions"] == done.definitions == VERSION == max(CHANGES)
+    assert "definitions" not in done.metrics and current(done) is done.metrics
+    folder = tmp_path / "old"
+    shutil.copytree(done.folder, folder)
+    (folder / "metrics.json").write_text(json.dumps({"formation.settling_s": -1.0}))
+    old = Run(folder)
+    assert (old.definitions, old.metrics["formation.settling_s"]) == (1, -1.0)
+    assert current(old) == metrics(old) and current(old)["formation.settling_s"] != -1.0
+    (folder / "metrics.json").write_text('{"definitions": "new"}')
+    with pytest.raises(InputError, match=r"metrics.json: definitions = 'new': must be a number of a version"):
+        current(Run(folder))

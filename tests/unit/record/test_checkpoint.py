@@ -120,6 +120,9 @@ class Unheard:
     def event(self, time, kind, **fields):
         pass
 
+    def turned(self, p):
+        pass
+
     def write(self, row):
         pass
 
@@ -128,7 +131,7 @@ class Unheard:
 
 
 #: The scenario, where everything is told, and what only the user sets.
-OUTSIDE = {"p", "world", "journal", "between"}
+OUTSIDE = {"p", "built", "world", "journal", "between"}
 
 #: What a stage may overwrite: written anew in every step before it is read, or made of the world's ways.
 WORK_SPACE = {
@@ -243,11 +246,30 @@ def test_a_loop_that_goes_on_from_a_checkpoint_remembers_all_that_one_does_which
     assert [name for name in CHANGED[case] if not any(name in place for place in changed)] == []
 
 
+def test_a_loop_that_goes_on_knows_which_way_round_its_trains_run(tmp_path):
+    """What stages hold of units they hold as the train runs; state and stages are those of a loop that went on."""
+    nets.terminals(tmp_path, nets.train("v", "ab bc -bc -ab ab", 0), scale=0.25)
+    unlike = nets.LAWS["fault_tolerant"]["train_type"] | {"unit_mass_kg": [8e4, 6e4, 4e4, 5e4]}
+    tables = nets.scenario("fault_tolerant", 400, train_type={"emu": unlike}, topology={"communication_period_s": 0.5})
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(tables))
+    p = open_scenario(str(tmp_path / "s.toml"))
+    with closing(Tape(Numeric(p.line), tmp_path)) as tape:
+        went_on = Loop(p, tape, Unheard())
+        while went_on.state.traffic.leg[0] == 0 or went_on.k % 10:
+            went_on.step()
+        checkpoint.write(tmp_path, went_on, {**checkpoint.identity(p), "tape": tape.save()})
+        again = from_checkpoint(p, tmp_path)
+        assert went_on.p.consists.mass.tolist() == [5e4, 4e4, 6e4, 8e4] == again.p.consists.mass.tolist()
+        assert lost(*(dict(remembered("state", loop.state)) for loop in (went_on, again))) == []
+        # Where trains may turn is made of the world's ways.
+        assert [place for place in lost(beside(went_on), beside(again)) if ".yards" not in place] == []
+
+
 def test_a_stage_that_keeps_something_to_itself_is_found_out():
     p = open_scenario("three_tracks")
     loop = Loop(p, Numeric(p.line), Unheard())
     made = beside(loop)
-    assert {"control.clamps", "orders.theta", "record.track_of", "protect.disturbing"} <= made.keys()
+    assert {"control.clamps", "orders.length", "record.track_of", "protect.disturbing"} <= made.keys()
     for stage, thing in (("control", 3), ("driver", [1.0]), ("protect", {"x": np.zeros(2)}), ("record", None)):
         getattr(loop, stage).hidden = thing
         assert any(place.startswith(f"{stage}.hidden") for place in lost(made, beside(loop))), stage

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import base64
+import itertools
 import json
 import re
 
 import numpy as np
 import pytest
+from PIL import Image, ImageSequence
 
 from trainctl.errors import InputError
 from trainctl.figures.trains import drawable
 from trainctl.record.recorder import Recorder, standard_tables
 from trainctl.report.animation import animation, frames
-from trainctl.report.page import page, report, three
-from trainctl.report.panels import natural, panels, told
+from trainctl.report.film import film
+from trainctl.report.film import unpacked as film_numbers
+from trainctl.report.page import page, raised, report, three
+from trainctl.report.panels import natural, panels, times, told
 from trainctl.runs.run import Run
 
 
 def unpacked(packed):
-    return np.frombuffer(base64.b64decode(packed["bdata"]), "<f4")
+    return film_numbers(packed)
 
 
 def data_of(text):
@@ -189,3 +193,30 @@ def test_a_run_without_trains_or_a_wrong_place_is_told(tmp_path):
     run = made_up(tmp_path / "run", 1, 3)
     with pytest.raises(InputError, match="cannot be written"):
         report(run, tmp_path / "nowhere" / "page.html")
+
+
+def test_whole_seconds_take_half_the_room():
+    whole, odd = times(np.array([0.0, 1.0, 65535.0])), times(np.array([0.0, 0.5]))
+    assert (whole["dtype"], odd["dtype"]) == ("u2", "f4")
+    assert np.frombuffer(base64.b64decode(whole["bdata"]), "<u2").tolist() == [0, 1, 65535]
+    assert {times(np.array(v))["dtype"] for v in ([65536.0], [-1.0], [np.nan], [])} == {"f4"}
+
+
+def test_powers_of_units_stand_above_the_line():
+    assert [raised(unit) for unit in ("m/s2", "m/s3", "kWh/km")] == ["m/s²", "m/s³", "kWh/km"]
+
+
+@pytest.mark.parametrize("kind", ["gif", "webp"])
+def test_a_film_has_a_picture_per_moment_and_trains_move_in_it(run, tmp_path, kind):
+    path = film(run, tmp_path / f"film.{kind}", seconds=0.5, from_s=990.0, until_s=1030.0)
+    with Image.open(path) as picture:
+        frames = [np.asarray(frame.convert("RGB"), int) for frame in ImageSequence.Iterator(picture)]
+    assert len(frames) == 6 and frames[0].shape[1] == 960
+    assert all((a != b).any() for a, b in itertools.pairwise(frames))
+
+
+def test_what_a_film_cannot_be_made_of_is_said(run, tmp_path):
+    with pytest.raises(InputError, match=r"film.mp4: must end in .gif or .webp"):
+        film(run, tmp_path / "film.mp4")
+    with pytest.raises(InputError, match="fewer than two recorded instants between 5000 and 1100 s"):
+        film(run, tmp_path / "film.gif", from_s=5000.0)

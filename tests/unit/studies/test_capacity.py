@@ -149,3 +149,28 @@ def test_a_folder_named_capacity_and_options_of_capacity(tmp_path: Path, monkeyp
     ):
         with pytest.raises(InputError, match=line):
             CliRunner().invoke(app, ["compare", *typed], catch_exceptions=False, standalone_mode=False)
+
+
+def test_laws_keep_the_spacings_that_were_found(tmp_path):
+    told = {"plan": {"brake_scatter": 0.1}, "rows": [
+        {"row": "sliding_mode", "spacing_m": 900.0}, {"row": "relative_braking", "spacing_m": 5000.0}, {"row": "fault_tolerant", "spacing_m": None},
+    ]}  # fmt: skip
+    (tmp_path / "spacing.json").write_text(json.dumps(told))
+    plan = SMALL._replace(found=capacity.found_in(tmp_path / "spacing.json"))
+    made = {row: capacity.scenario(plan, row) for row in ("sliding_mode", "relative_braking", "fault_tolerant", "moving_block")}
+    assert {row: m["topology"]["spacing_m"] for row, m in made.items()} == {
+        "sliding_mode": 900.0, "relative_braking": 5000.0, "fault_tolerant": 3000.0, "moving_block": 3000.0,
+    }  # fmt: skip
+    apart = {row: m["train"][0]["position_m"] - m["train"][2]["position_m"] for row, m in made.items()}
+    assert apart["sliding_mode"] == pytest.approx(1800.0, abs=80.0) and apart["relative_braking"] == pytest.approx(
+        10_000.0, abs=80.0
+    )
+    assert min(t["position_m"] for m in made.values() for t in m["train"]) > 0.0
+    assert made["relative_braking"]["controller"]["braking_mps2"] == pytest.approx(0.9 * 218.4 / 436.8)
+    assert capacity.ideal(plan, "sliding_mode")["headway_s"] == pytest.approx(900.0 / plan.cruise_mps)
+    for text, rule in ((None, "No such file or directory"), ("{}", "must be a spacing.json of `trainctl compare spacing`")):
+        file = tmp_path / "other.json"
+        if text is not None:
+            file.write_text(text)
+        with pytest.raises(InputError, match=rule):
+            capacity.found_in(file)

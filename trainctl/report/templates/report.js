@@ -4,7 +4,7 @@
   const at = (id) => document.getElementById(id);
   const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-  const floats = (packed) => new Float32Array(bytes(packed.bdata).buffer);
+  const floats = (packed) => packed.dtype === "i2" ? Float32Array.from(new Int16Array(bytes(packed.bdata).buffer), (v) => v === -32768 ? NaN : v / 1000) : new Float32Array(bytes(packed.bdata).buffer);
 
   // ---- plots -------------------------------------------------------------------------------------------------------------------
   const plots = [];
@@ -14,8 +14,16 @@
     const stated = document.documentElement.dataset.theme;
     return stated ? stated === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
   };
-  // black and the darkest blue do not show on a dark page
-  const shown = (color) => (color === "ink" || color === "#000000") ? css("--ink") : (isDark() && color === "#0072B2") ? "#6f86ff" : color;
+  // black and dark blues do not show on a dark page
+  function shown(color) {
+    if (color === "ink" || color === "#000000") return css("--ink");
+    if (!isDark() || !/^#[0-9a-f]{6}$/i.test(color)) return color;
+    if (color === "#0072B2") return "#6f86ff";
+    const parts = [1, 3, 5].map((k) => parseInt(color.slice(k, k + 2), 16)), light = (0.3 * parts[0] + 0.59 * parts[1] + 0.11 * parts[2]) / 255;
+    if (light > 0.42) return color;
+    const white = (0.42 - light) / (1 - light);
+    return "#" + parts.map((v) => Math.round(v + white * (255 - v)).toString(16).padStart(2, "0")).join("");
+  }
   const faint = (color) => { const c = shown(color); return c.startsWith("#") && c.length === 7 ? c + "2e" : c; };
 
   const hidden = new Set(); // trains that are not drawn in any plot
@@ -71,9 +79,10 @@
   }
   const safe = (text) => text.replace(/&/g, "&amp;").replace(/</g, "&lt;");
 
-  // plotly leaves shapes out of the automatic range: an unseen pair of points at the bounds brings them in
+  // plotly leaves shapes out of the automatic range: unseen points at the bounds, and at stops that no train reached, bring them in
   function anchors(panel) {
     const values = (panel.bounds || []).filter((b) => !b.far).map((b) => b.value);
+    values.push(...(panel.places || []).filter((p) => p.unreached).map((p) => p.value));
     if (panel.least_range && !values.length) values.push(-panel.least_range / 2, panel.least_range / 2);
     return values.length ? [{ type: "scatter", mode: "markers", x: values.map(() => whole[0]), y: values, marker: { opacity: 0, size: 1 }, hoverinfo: "skip", showlegend: false }] : [];
   }
@@ -140,6 +149,7 @@
       if (wanted.has(name)) hidden.delete(name); else hidden.add(name);
       chips.get(name).setAttribute("aria-pressed", String(wanted.has(name)));
     }
+    if (filmed) paint_mini(0);
     for (const p of plots.slice(0, drawn)) Plotly.restyle(p.draw, { visible: p.panel.traces.map(drawn_now) }, p.panel.traces.map((_, k) => k));
   }
   for (const name of names) {
@@ -203,9 +213,12 @@
   // words are left out where they would lie on others
   let taken = [];
   function write(text, x, y) {
-    const width = pen.measureText(text).width, left = x - (pen.textAlign === "center" ? width / 2 : 0);
-    if (taken.some(([l, r, at]) => left < r + 3 && left + width > l - 3 && Math.abs(at - y) < 12)) return;
+    const width = pen.measureText(text).width, edge = canvas.clientWidth - 4;
+    if (pen.textAlign === "left" && x < edge) x = Math.min(x, edge - width);
+    const left = x - (pen.textAlign === "center" ? width / 2 : 0);
+    if (taken.some(([l, r, at]) => left < r + 3 && left + width > l - 3 && Math.abs(at - y) < 12)) return false;
     taken.push([left, left + width, y]); pen.fillText(text, x, y);
+    return true;
   }
 
   // a net of any shape: true to scale, unless it is so long and flat that nothing could be told apart
@@ -226,6 +239,11 @@
       move = false;
     }
     pen.stroke();
+    pen.font = "12px system-ui, DejaVu Sans, sans-serif"; pen.textAlign = "left"; pen.strokeStyle = css("--ink"); pen.lineWidth = 1.5;
+    for (const stop of film.stops || []) { // squares across the track: filled where a train came
+      const x = px(stop.x), y = py(stop.y);
+      pen.fillStyle = css(stop.reached ? "--ink" : "--panel"); pen.beginPath(); pen.rect(x - 4, y - 4, 8, 8); pen.fill(); pen.stroke();
+    }
     pen.strokeStyle = css("--accent");
     for (let c = 0; c < couples; c++) {
       const state = links[frame * couples + c], a = here[film.pairs[c][0]], b = here[film.pairs[c][1]];
@@ -243,15 +261,50 @@
         pen.fillStyle = css("--ink"); pen.font = "bold 12px system-ui, DejaVu Sans, sans-serif"; pen.textAlign = "left"; write(film.trains[k].name, x + 9, y + (k % 2 ? 14 : -12));
       }
     });
+    pen.font = "12px system-ui, DejaVu Sans, sans-serif"; // stops are named where the trains leave room
+    for (const stop of film.stops || []) {
+      const x = px(stop.x), y = py(stop.y), words = stop.name + (stop.reached ? "" : narrow() ? " (none came)" : " (no train came)");
+      pen.fillStyle = css(stop.reached ? "--ink" : "--soft");
+      if (![14, -14, 28, -28].some((d) => write(words, x + 9, y + d))) write(words, x - 9 - pen.measureText(words).width, y);
+    }
     let step = Math.pow(10, Math.floor(Math.log10(width / sx / 4)));
     step *= width / sx / step > 20 ? 5 : width / sx / step > 8 ? 2 : 1;
     const soft = css("--soft"); pen.strokeStyle = soft; pen.fillStyle = soft; pen.lineWidth = 2; pen.textAlign = "left"; pen.font = "12px system-ui, DejaVu Sans, sans-serif";
     pen.beginPath(); pen.moveTo(14, height - 16); pen.lineTo(14 + step * sx, height - 16); pen.stroke();
-    pen.fillText((step >= 1000 ? step / 1000 + " km" : step + " m") + (raised > 1 ? `, northwards drawn ${raised.toFixed(1)} times as large` : ""), 22 + step * sx, height - 16);
+    pen.fillText((step >= 1000 ? step / 1000 + " km" : step + " m") + (raised <= 1 ? "" : narrow() ? `, northwards × ${raised.toFixed(1)}` : `, northwards drawn ${raised.toFixed(1)} times as large`), 22 + step * sx, height - 16);
     pen.fillStyle = css("--ink"); pen.font = "bold 13px system-ui, DejaVu Sans, sans-serif"; pen.fillText("t = " + when(now), 8, 16);
   }
 
+  // the same in small, beside the legend, in sight while plots are read
+  const mini = at("mini"), thin = mini.getContext("2d");
+  mini.hidden = !filmed;
+  function paint_mini(share) {
+    const ratio = devicePixelRatio || 1, width = mini.clientWidth, high = mini.clientHeight;
+    if (!width) return;
+    mini.width = Math.round(width * ratio); mini.height = Math.round(high * ratio);
+    thin.setTransform(ratio, 0, 0, ratio, 0, 0);
+    const here = film.trains.map((_, k) => place(k, share)), some = here.filter((p) => p);
+    let px, py;
+    thin.strokeStyle = css("--track"); thin.lineWidth = 1; thin.beginPath();
+    if (map) {
+      const [[west, east], [south, north]] = box, scale = Math.min((width - 14) / Math.max(east - west, 100), 1e9), up = Math.min((high - 14) / Math.max(north - south, 100), 8 * scale);
+      px = (x) => width / 2 + Math.min(scale, 8 * up) * (x - (west + east) / 2); py = (y) => high / 2 - up * (y - (south + north) / 2);
+      for (let k = 0, move = true; k < map[0].length; k++) {
+        if (Number.isNaN(map[0][k])) { move = true; continue; }
+        if (move) thin.moveTo(px(map[0][k]), py(map[1][k])); else thin.lineTo(px(map[0][k]), py(map[1][k]));
+        move = false;
+      }
+    } else {
+      const xs = some.map((p) => p.x), middle = (Math.min(...xs) + Math.max(...xs)) / 2;
+      px = (x) => width / 2 + (x - middle) / reach * (width - 14); py = (side) => (side + 0.5) * high / film.tracks.length;
+      film.tracks.forEach((_, k) => { thin.moveTo(0, py(k)); thin.lineTo(width, py(k)); });
+    }
+    thin.stroke();
+    here.forEach((p, k) => { if (p && !hidden.has(film.trains[k].name)) { thin.fillStyle = shown(film.trains[k].color); thin.beginPath(); thin.arc(px(p.x), py(p.side), count > 30 ? 2.5 : 4, 0, 7); thin.fill(); } });
+  }
+
   function paint(share) {
+    paint_mini(share);
     const ratio = devicePixelRatio || 1, width = canvas.clientWidth;
     if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
       canvas.width = Math.round(width * ratio); canvas.height = Math.round(height * ratio); canvas.style.height = height + "px";
@@ -273,7 +326,7 @@
 
     // kilometrage
     let step = Math.pow(10, Math.floor(Math.log10(span / 5)));
-    step *= span / step > 25 ? 5 : span / step > 12 ? 2 : 1;
+    step *= [0.5, 1, 2, 5, 10].find((times) => span / (times * step) < Math.min(room / 62, 20)) || 20;
     pen.textAlign = "center"; pen.lineWidth = 1;
     for (let x = Math.ceil((centre - span / 2) / step) * step; x < centre + span / 2; x += step) {
       pen.strokeStyle = line; pen.beginPath(); pen.moveTo(px(x), 34); pen.lineTo(px(x), height - 26); pen.stroke();
@@ -316,7 +369,7 @@
       pen.beginPath(); pen.arc(x, y, 7, 0, 7); pen.fill(); pen.stroke();
       if (count <= 30 || +at("zoom").value > 2) {
         pen.fillStyle = ink; pen.font = "bold 13px system-ui, DejaVu Sans, sans-serif"; pen.textAlign = "left"; write(train.name, x + 10, y - 9);
-        pen.font = "11px system-ui, DejaVu Sans, sans-serif"; pen.fillStyle = soft; pen.textAlign = "center"; write((data.per_mps * p.v).toFixed(1) + " " + data.speed_unit, x, y + 16);
+        pen.font = "11px system-ui, DejaVu Sans, sans-serif"; pen.fillStyle = soft; pen.textAlign = "center"; if (!narrow()) write((data.per_mps * p.v).toFixed(1) + " " + data.speed_unit, x, y + 16);
       }
     });
     pen.restore();

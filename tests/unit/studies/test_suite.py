@@ -1,0 +1,82 @@
+"""Laws in situations: what happens in each, that cells are the same however they are run, and the page."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from trainctl.errors import InputError
+from trainctl.studies import suite, suite_shown
+from trainctl.studies.stops import REFUSED
+from trainctl.studies.suite import SITUATIONS, Cell, SuitePlan, cell, tables_of
+
+PLAN = SuitePlan(runs=2, spacing_m=2000.0)
+
+
+@pytest.mark.parametrize("situation", SITUATIONS)
+def test_every_situation_is_a_scenario_without_mistakes(situation, tmp_path) -> None:
+    """Under a law that refuses none of them; and something happens to every run."""
+    found = cell(PLAN, "time_headway", situation, tmp_path)
+    assert found.what == "run" and found.why == "" and found.of == 2 and found.gap_m > 100.0
+    tables, _ = tables_of(PLAN, "time_headway", situation)
+    ordered = {e["train"].partition(".")[0] for e in tables["event"] if e["train"] != "all"}
+    assert ordered == (set() if situation in ("calm", "gradient") else {"0", "1"})
+
+
+def test_a_train_that_joins_makes_six_of_five_and_one_that_leaves_five_of_six(tmp_path) -> None:
+    """Told from what is left in the middle: joined trains are half a spacing apart at first, those behind a leaver two."""
+    calm, join = (cell(PLAN, "relative_braking", name, tmp_path / name) for name in ("calm", "join"))
+    assert calm.gap_m > 1700.0 and 500.0 < join.gap_m < 900.0
+    assert cell(PLAN, "relative_braking", "leave", tmp_path / "leave").error_m > 1000.0 > calm.error_m
+
+
+def test_an_outage_and_a_lost_unit_make_a_difference(tmp_path) -> None:
+    stop, outage, lost = (cell(PLAN, "time_headway", name, tmp_path / name) for name in ("stop", "outage", "unit_lost"))
+    assert outage.gap_m != stop.gap_m and lost.error_m > stop.error_m + 10.0
+
+
+def test_a_law_that_may_not_start_is_refused(tmp_path) -> None:
+    found = cell(PLAN, "fully_distributed", "gradient", tmp_path)
+    assert found.what == REFUSED and "10 per mil" in found.why and found.plain()["interval_95"] is None
+
+
+def test_cells_are_the_same_with_one_and_two_workers_and_resumed(tmp_path, monkeypatch) -> None:
+    rows, names = ("time_headway", "sliding_mode"), ("calm", "stop")
+    one = suite.compare(PLAN, tmp_path / "one", rows, names, workers=1)
+    suite.compare(PLAN, tmp_path / "two", rows, names, workers=2)
+    for place in sorted((tmp_path / "one").rglob("*.json")):
+        assert place.read_bytes() == (tmp_path / "two" / place.relative_to(tmp_path / "one")).read_bytes()
+    assert [(c["row"], c["situation"]) for c in one] == [(row, name) for row in rows for name in names]
+    kept = tmp_path / "two" / "cells" / "time_headway" / "calm" / "cell.json"
+    kept.write_text(json.dumps({**json.loads(kept.read_text()), "failed": 1}))
+    shutil.rmtree(tmp_path / "two" / "cells" / "sliding_mode" / "stop")
+    again = suite.compare(PLAN, tmp_path / "two", rows, names, workers=1, resume=True)
+    assert again[0]["failed"] == 1 and again[3] == one[3]  # what was done stays, the rest is run
+    with pytest.raises(InputError, match="asks something else"):
+        suite.compare(PLAN._replace(runs=3), tmp_path / "two", rows, names, resume=True)
+
+
+CELLS = [
+    Cell("time_headway", "calm", "run", "", 0, 20, 812.0, 1.5, 0.04).plain(),
+    Cell("time_headway", "stop", "run", "", 3, 20, -2.0, 9.0, 0.05).plain(),
+    Cell("fully_distributed", "calm", REFUSED, "a < b & c", 0, 20, None, None, None).plain(),
+    Cell("fully_distributed", "stop", "run", "its numbers are no longer finite", 20, 20, None, None, None).plain(),
+]
+
+
+def test_the_page_has_a_cell_for_each_pair_and_says_why(tmp_path) -> None:
+    page = suite_shown.page(CELLS, SuitePlan())
+    assert page.count("<td") == 4 and "class='bad'>3 of 20 (5.2 .. 36 %)" in page and "class='good'>0 of 20 (0 .. 16 %)" in page
+    assert "a &lt; b &amp; c" in page and "no longer finite" in page and "src=" not in page
+    assert suite_shown.write_page(CELLS, SuitePlan(), tmp_path).read_text() == page
+
+
+def test_the_command(typed) -> None:
+    status, said = typed("compare", "suite", "--rows", "nobody")
+    assert status == 2 and said[0].startswith("--rows nobody: no such row; there are: ")
+    assert typed("compare", "suite", "--stops", "3") == (2, ["--stops: not with `trainctl compare suite`"])
+    assert typed("compare", "suite", "--runs", "0") == (2, ["--runs: must be at least 1"])
+    assert typed("compare", "spacing", "--resume") == (2, ["--resume: not with `trainctl compare spacing`"])
+    assert typed("compare", "a", "--runs", "3") == (2, ["--runs: only with `trainctl compare suite`"])
