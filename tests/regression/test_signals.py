@@ -314,3 +314,17 @@ def test_what_is_chosen_is_said(tmp_path, signals, cooperate, obeys, said):
     p = open_scenario(str(tmp_path / "s.toml"))
     assert p.obeys is obeys
     assert any(said in note for note in p.roster.notes) if said else not any("signals" in note for note in p.roster.notes)
+
+
+@pytest.mark.parametrize(("driving", "turns"), [({"signals": "obey"}, 2), ({"others": "sumo", "cooperate": ["w"]}, 0)])
+def test_trains_turn_back_where_signals_are_obeyed_ours_and_those_of_sumo(tmp_path, driving, turns):
+    """A shuttle on a single track, and one that comes in from a branch."""
+    nodes = {"a": (0, 0), "b": (2000, 0), "c": (3500, 0), "d": (3250, 450)}
+    track = {**nets.both_ways("ab", "a", "b"), **nets.both_ways("bc", "b", "c"), **nets.both_ways("bd", "b", "d")}
+    nets.net(tmp_path, nodes, track, nets.TERMINALS, signals="b")
+    halts = "".join(f'<stop lane="{edge}_0" duration="20"/>' for edge in ("bc", "-ab"))
+    nets.traffic(tmp_path, nets.train("v", "ab bc -bc -ab ab bc", 0, halts) + nets.train("w", "-bd -ab", 200))
+    found = ran(tmp_path, 800, **driving)
+    assert set(at(found, "arrive")) == {"v", "w"} and not amiss(found) and found.ok
+    assert sum(e["kind"] == "turn" for e in found.events) == turns  # SUMO's turn without a word
+    assert sum(e["kind"] == "stop_left" for e in found.events) == 2 == len(found.stops.dropna(subset=["departure_s"]))

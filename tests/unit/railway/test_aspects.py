@@ -83,6 +83,19 @@ def test_a_red_that_is_passed_is_told(line):
     assert not any(one.passed for one in told)  # that one had green
 
 
+def test_a_train_that_turned_or_was_led_another_way_has_passed_nothing(line):
+    for other in ([0, 2, 3], [0, 2, 3], [1, 2, 3]), ([0, 3], [0, 2, 3], [1, 2, 3]):
+        line.state, line.ways = aspects.none(3, 3), Line().ways
+        line.go([999.0, 500.0, 300.0], {2}, 5)
+        passes = len(other[0]) == 3
+        new = ways(other, np.zeros(4), LENGTH)
+        seen = aspects.sighted(new, aspects.table(new, np.zeros(4, bool), SIGNALS), new.first[:-1] + [1, 0, 0],
+                               np.array([1003.0, 500.0, 300.0]), np.ones(3, bool), np.full(3, FAR))  # fmt: skip
+        told = aspects.decide(new, seen, np.zeros(len(seen.signal), bool), np.array([1003.0, 500.0, 300.0]), np.ones(3, bool),
+                              np.zeros(3), line.state)[2]  # fmt: skip
+        assert [one.passed for one in told] == [True] * passes
+
+
 def test_who_is_not_there_may_go_to_its_first_signal_and_is_in_nobodys_way(line):
     held, told = line.go([800.0, 500.0, 300.0], {0, 1, 2}, 5, 900.0, (1, 2))
     assert held.room[0] == 199.5 and np.isinf(held.room[1]) and not told  # train 1 is the first that is there
