@@ -3,13 +3,14 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: run test lint clean help
+.PHONY: run test lint docs clean help
 
 help:
 	@echo "make run    the default scenario, headless, into runs/three_tracks"
 	@echo "make test   the test suite, on two processors"
 	@echo "make lint   ruff, mypy and the import rules"
-	@echo "make clean  remove .venv and runs"
+	@echo "make docs   the pages as a site, build/site/index.html"
+	@echo "make clean  remove .venv, build and runs"
 
 run: $(READY)
 	$(BIN)/trainctl run
@@ -23,6 +24,9 @@ lint: $(READY)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+docs: $(READY)
+	$(BIN)/python tools/site.py
+
 # The last line compiles the kernels once, so that the first run does not wait for them.
 $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "trainctl needs Python 3.11 or later")'
@@ -33,4 +37,4 @@ $(READY): requirements.lock pyproject.toml
 	@touch $(READY)
 
 clean:
-	rm -rf .venv runs
+	rm -rf .venv build runs

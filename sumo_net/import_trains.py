@@ -145,7 +145,7 @@ def railtoolkit(data: Place, options: Options) -> Imported:
         if len(rows) > 1:
             notes.append(f"{len(rows)} vehicles as one rigid unit: those without traction have no force of their own")
     if options.units != 1:
-        raise data.wrong("--units: this file tells the vehicles; leave it out", "")
+        raise data.wrong("--units: this file lists the vehicles; leave it out", "")
     fits = {id(v): fitted(_effort(v)) for v in powered}
     for fit in dict.fromkeys(fits.values()):
         notes.append(

@@ -254,7 +254,7 @@ def _railtoolkit_path(data: Place, options: Options) -> Imported:
     name = path["id"].text()
     rows = [row.row(3) for row in path["characteristic_sections"].items()]
     if len(rows) < 2:
-        raise path["characteristic_sections"].wrong("must have at least two rows: the last one tells where the path ends")
+        raise path["characteristic_sections"].wrong("must have at least two rows: the last one says where the path ends")
     table = sorted((a.number(), b.number(above=0.0) / 3.6, c.number()) for a, b, c, *_ in rows)
     origin = table[0][0]
     stops: list[tuple[float, str]] = []

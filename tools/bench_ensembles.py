@@ -65,7 +65,7 @@ def models(runs: int, loss: float, errors: bool) -> list[Any]:
     (batch,) = batches(SweepPlan(made.scenario, settings, range(runs), made.jitter, "numeric"))
     found: list[Any] = []
     for job in batch.each():
-        found.append(job_model(job, found[0] if found else None))
+        found.append(job_model(job, like=found[0] if found else None))
     return found
 
 

@@ -227,12 +227,12 @@ class Simulation:
 
     @property
     def position_m(self) -> Floats:
-        """Front of every train on the line, shape (n,)."""
+        """Front of every train on the line [m], shape (n,)."""
         return self._loop.world.measure().position.copy()
 
     @property
     def speed_mps(self) -> Floats:
-        """Speed of every train's head, shape (n,)."""
+        """Speed of every train's leading unit [m/s], shape (n,)."""
         return np.asarray(self._loop.state.own[self._loop.p.leading, SPEED].copy())
 
     @property
@@ -270,7 +270,7 @@ class Simulation:
 
     @property
     def links(self) -> pd.DataFrame:
-        """Who hears whom in the last step: sender, receiver, spacing_m, desired_m, lower_m, upper_m, heard."""
+        """Who received from whom in the last step: sender, receiver, spacing_m, desired_m, lower_m, upper_m, heard."""
         links = self._loop.state.formed.links
         if links is None:  # before the first step
             links = self._loop.p.first_links
@@ -286,7 +286,7 @@ class Simulation:
     def reference_of(self, train: str) -> tuple[float, float]:
         """Position [m] along the train's own way and speed [m/s] of the reference it follows now.
 
-        Where trains come and go that is the reference of its formation; a train in none follows nobody but itself.
+        Where trains come and go that is the reference of its formation; a train in none is a reference of its own.
         """
         i, formed = self._number(train), self._loop.state.formed
         if not formed.led[i]:

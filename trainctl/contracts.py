@@ -69,7 +69,7 @@ class ContinuousLaw(Protocol):
     Arrays ``own``, ``estimate``, ``correction`` and ``out`` hold the units of train ``i`` only, ``desired`` and ``heard``
     what its links bring: locality by construction. ``constants`` is a NamedTuple of floats and arrays made by ``constants()``;
     per-unit arrays in it are indexed from its own ``first[i]``. ``leader`` is (4,): position, speed, acceleration, jerk of the
-    reference now; ``slot`` the train's wanted position relative to it [m].
+    reference now; ``slot`` the train's nominal position relative to it [m].
     """
 
     CLOCK: Literal["continuous"]
@@ -90,7 +90,7 @@ class ContinuousLaw(Protocol):
     ) -> None:  # fmt: skip
         """Write the demanded force of each unit [N] into ``out``.
 
-        ``desired`` (k,) and ``heard`` (k, w) are the rows of the k links train ``i`` hears on; ``age`` [s] is how old ``heard`` is
+        ``desired`` (k,) and ``heard`` (k, w) are the rows of the k links to train ``i``; ``age`` [s] is how old ``heard`` is
         (0 in the exact mode).
         """
 

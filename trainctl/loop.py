@@ -120,7 +120,7 @@ class Loop(Steps):
         for i in np.flatnonzero((going.standing != s.traffic.standing) & ~(going.parked | s.traffic.parked) & self.ours).tolist():
             world.halt(i, bool(going.standing[i]))
 
-        # topology: -> who hears whom, desired spacing and bounds of each link, the law's constants
+        # topology: -> who receives from whom, desired spacing and bounds of each link, the law's constants
         seen = here._replace(position=here.position + s.formed.offset)
         rule, formed, messages, own, seen, scene = self.topology.step(
             t, seen, own, around, going, s.rule, s.formed, s.messages
@@ -246,7 +246,7 @@ class Loop(Steps):
         return own
 
     def _relinked(self, t: float, scene: Any, formed: Formed, units: plant.State, watch: record.State) -> plant.State:
-        """Tell the plant, the alarms and the world who hears whom from now on."""
+        """Tell the plant, the alarms and the world who receives from whom from now on."""
         units = self.plant.relinked(scene, formed.constants, units)
         self.world.linked(scene.links, formed.formation)
         self.record.relinked(t, scene, formed, watch)

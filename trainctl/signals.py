@@ -3,7 +3,7 @@
 Controllers, plants, observers and topology meet only here. Every array is float64, int64 or bool, C-contiguous, SI.
 
 Counts used in shapes: ``n`` trains, ``U`` units of all trains one after the other, ``L`` links, ``w`` numbers in one message.
-A train's units are the rows ``first[i]:first[i + 1]``, head first. A point train has one unit.
+A train's units are the rows ``first[i]:first[i + 1]``, leading unit first. A point train has one unit.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Consists(NamedTuple):
     braking: Floats  # N, positive
     braking_power: Floats  # W
     actuator_rate: Floats  # 1/s, r of the actuator tau' = -r tau + r demand
-    installed: Bools = np.zeros(0, np.bool_)  # the force of this unit's train is shared out by installed force; empty: nobody's
+    installed: Bools = np.zeros(0, np.bool_)  # the force of this unit's train is shared out by installed force; empty: no train
 
     def by_installed_force(self) -> Bools:
         """Whether the force of every train is shared out by what its units have installed, shape (n,); else it goes by mass."""
@@ -98,18 +98,18 @@ def turned_rows(first: Ints, turned: Bools, couplers: bool = False) -> Ints:
 
 
 class Links(NamedTuple):
-    """Who hears whom now: one row per directed hearing, sorted by receiver. Spacings are front to front, sender minus receiver."""
+    """Who receives from whom now: one row per direction, sorted by receiver. Spacings are front to front, sender minus receiver."""
 
     sender: Ints  # (L,)
     receiver: Ints  # (L,)
-    first: Ints  # (n + 1,) rows first[i]:first[i + 1] are what train i hears
+    first: Ints  # (n + 1,) rows first[i]:first[i + 1] are the links train i receives on
     desired: Floats  # (L,) m
     lower: Floats  # (L,) m, -inf if unbounded
     upper: Floats  # (L,) m, inf if unbounded
     weight: Floats  # (L,)
     heard: Bools  # (L,) False: the last message did not arrive
-    slot: Floats  # (n,) m, wanted position relative to the reference (0 or negative); NaN where the scenario has no slots
-    order: Ints  # (n,) all trains, every train after those it hears from ahead (front to rear)
+    slot: Floats  # (n,) m, nominal position relative to the reference (0 or negative); NaN where the scenario has no slots
+    order: Ints  # (n,) all trains, every train after those ahead that it receives from (front to rear)
 
 
 class Bounds(NamedTuple):
@@ -245,7 +245,7 @@ class Scene(NamedTuple):
 
 
 def restrict(scene: Scene, members: Ints) -> Scene:
-    """Return the scene of one formation alone; ``members`` (k,) are its trains, nobody else hears them."""
+    """Return the scene of one formation alone; ``members`` (k,) are its trains, no other train receives from them."""
     new = np.full(len(scene.trains), -1)
     new[members] = np.arange(len(members))
     count = np.diff(scene.consists.first)

@@ -1,7 +1,7 @@
 """Checks that every sampled law must pass, for the author of one: what the contract in ``trainctl.signals`` says, as assertions.
 
 ``check_sampled_law(my_law)`` runs all; ``CHECKS`` lists them for ``pytest.mark.parametrize``. Six point trains on one track hear
-their neighbours, with one link more and one train that hears nobody; the reference runs at 80 m/s.
+their neighbours, with one link more and one train that receives nothing; the reference runs at 80 m/s.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from trainctl.signals import Bounds, Consists, Demand, Floats, Links, Reference,
 
 SPACING = 5000.0
 SLOT = -SPACING * np.arange(6.0)
-EDGES = [(0, 1), (1, 2), (2, 3), (3, 4), (0, 2)]  # the last train hears nobody
+EDGES = [(0, 1), (1, 2), (2, 3), (3, 4), (0, 2)]  # the last train receives nothing
 LEADER = np.array([30000.0, 80.0, 0.0, 0.0])
 DAVIS = (1.176e-2, 7.7616e-4, 1.6e-5)
 N = len(SLOT)
@@ -127,7 +127,7 @@ def check_local(x: Example) -> None:
 
 
 def check_numbering_of_the_trains_does_not_matter(x: Example) -> None:
-    """A train's demand depends on what it hears, not on its row."""
+    """A train's demand depends on what it receives, not on its row."""
     own, hearing = disturbed(), links(x)
     expected = demand(x, own).acceleration
     back = np.arange(N)[::-1]

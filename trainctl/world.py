@@ -61,7 +61,7 @@ class World(Protocol):
         """
 
     def linked(self, links: Links, formation: Ints) -> None:
-        """Who hears whom from now on, and which formation (n,) every train is in: for simulators that show it."""
+        """Who receives from whom from now on, and which formation (n,) every train is in: for simulators that show it."""
 
     def move(self, displacement: Floats, step: float) -> None:
         """Let every train move by ``displacement`` (n,) [m] within one step, and end the step."""

@@ -42,7 +42,7 @@ def test_couplers_carry_what_a_trailer_needs_and_every_bound_holds(done: Any) ->
         ({CAR + "force_share": "weight"}, "train_type.emu.force_share = weight: input should be 'mass' or 'installed'"),
         (
             {"controller": {"law": "emu_finite_time"}},
-            "train_type.emu.force_share = installed: law emu_finite_time tells every unit its own force",
+            "train_type.emu.force_share = installed: law emu_finite_time gives every unit its own force",
         ),
     ],
 )

@@ -213,7 +213,7 @@ def test_what_cannot_be_followed_is_told_with_the_reason_and_changes_nothing(tmp
         assert sim.track[0] == "1"
     (_, locked), (_, fast), (_, already) = orders(tmp_path / "r")
     assert locked.startswith("switch x1-3_25000 at 25000.0 m is locked: 600.0 m ahead, braking takes ")
-    assert fast.startswith("crossover x1-3_35000 allows 44.444 m/s, the train runs at 85 m/s, and nobody would brake it")
+    assert fast.startswith("crossover x1-3_35000 allows 44.444 m/s, the train runs at 85 m/s and nothing would brake it")
     assert already == "the train is on track 1 already"
     assert trainctl.open(tmp_path / "r").info["status"] == "complete"
 

@@ -34,6 +34,7 @@ PAGES = (
     "sumo_net/README.md",
     "sumo_net/OSM.md",
     "tools/README.md",
+    "tools/gallery/README.md",
     "trainctl/README.md",
     "trainctl/GLOSSARY.md",
     "trainctl/INSTALL.md",
@@ -65,6 +66,9 @@ REPLACED: dict[str, tuple[str | None, str]] = {
     "trainctl run three_tracks --set controller.law=sumo --set controller.signals_m=4000 --out runs/fixed": (
         "trainctl run three_tracks --set controller.law=sumo --set controller.signals_m=4000 --out runs/fixed"
         " --set run.duration_s=60", "quicker"),
+    "trainctl run fault_tolerant_noise --backend numeric": (
+        "trainctl run fault_tolerant_noise --backend numeric --set run.duration_s=10 --out runs/fault_tolerant_noise", "160 s take too long"),
+    "trainctl run robust_three_tracks": ("trainctl run robust_three_tracks --set run.duration_s=24 --out runs/robust_three_tracks", "quicker"),
     "trainctl compare capacity": (None, "three minutes; tests/unit/studies/test_capacity.py runs it"),
     "trainctl run my_law/my_law.toml": ("trainctl run my_law/my_law.toml --set run.duration_s=24", "2400 s take too long"),
     "python -m pytest my_law": (None, "test_new.py runs these tests"),

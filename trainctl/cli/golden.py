@@ -37,7 +37,7 @@ def register(app: typer.Typer) -> None:
     ) -> None:
         """Keep a run or SUMO's logs as a golden: thinned in time, without clocks and paths, compressed.
 
-        A golden that is there is replaced, unseen; `trainctl golden update` shows what moves.
+        A golden that is there is replaced without a comparison; `trainctl golden update` shows what moves.
         """
         from trainctl.diff.golden import make_golden
 

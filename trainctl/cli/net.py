@@ -101,7 +101,7 @@ def net_show(
     from_m: Annotated[float | None, typer.Option(help="Show from this kilometrage on [m].")] = None,
     to_m: Annotated[float | None, typer.Option(help="Show up to this kilometrage [m].")] = None,
 ) -> None:
-    """Draw tracks and crossovers of a line, or any SUMO rail net as it lies."""
+    """Draw tracks and crossovers of a line, or a map of any SUMO rail net."""
     import sumo_net
     from sumo_net.picture import show as draw
     from sumo_net.picture import show_net

@@ -116,7 +116,7 @@ def compare(
     `trainctl compare capacity` runs the same trains on the same line under SUMO's fixed block and moving block and under every law:
     headway, trains per hour, journey time, energy, collisions.
 
-    `trainctl compare spacing` finds for every law the smallest spacing at which nobody touches when the first train makes an
+    `trainctl compare spacing` finds for every law the smallest spacing at which no trains touch when the first train makes an
     emergency stop, in all of many stops with late and lost messages and brakes that scatter.
 
     `trainctl compare suite` runs every law in every situation (join, leave, stop, emergency stop, outage, bursts, gradient, unit

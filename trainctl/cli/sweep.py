@@ -43,7 +43,7 @@ def register(app: typer.Typer) -> None:
         keep: Annotated[
             bool, typer.Option("--keep", help="Keep all run folders in OUT/runs (workers need the same file system).")
         ] = False,
-        strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if any run broke a bound.")] = False,
+        strict: Annotated[bool, typer.Option("--strict", help="Exit 1 if any run violated a bound.")] = False,
         quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no summary.")] = False,
         as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")] = False,
     ) -> None:

@@ -145,6 +145,4 @@ def named(scene: Scene, who: Followed, i: int) -> str:
 def braking_violations(scene: Scene, brakes: Floats, key: str) -> Iterator[str]:
     """Trains whose braking nobody states."""
     for i in np.flatnonzero(~np.isfinite(brakes)).tolist():
-        yield (
-            f"{key}: missing; train {scene.trains[i]} has neither braking_n nor a bound of its input that tells how hard it brakes"
-        )
+        yield (f"{key}: missing; train {scene.trains[i]} has neither braking_n nor an input bound from which its braking follows")

@@ -96,8 +96,8 @@ class Params(Table):
     p_2: float = Field(1e-4, gt=0.0, description="Gain on positions between trains, eq. (13) [m^(1-alpha_1)/s2]")
     p_3: float = Field(10.0, gt=0.0, description="Gain on speeds in the train, eq. (13) [(m/s)^(1-alpha_2)/s]")
     p_4: float = Field(1.0, gt=0.0, description="Gain on speeds between trains, eq. (13) [(m/s)^(1-alpha_2)/s]")
-    mu_1: float = Field(0.05, gt=0.0, description="Gain of a head on its position error, eq. (13) [m^(1-alpha_1)/s2]")
-    mu_2: float = Field(0.1, gt=0.0, description="Gain of a head on its speed error, eq. (13) [(m/s)^(1-alpha_2)/s]")
+    mu_1: float = Field(0.05, gt=0.0, description="Gain of a leading unit on its position error, eq. (13) [m^(1-alpha_1)/s2]")
+    mu_2: float = Field(0.1, gt=0.0, description="Gain of a leading unit on its speed error, eq. (13) [(m/s)^(1-alpha_2)/s]")
     weighted_by_mass: bool = Field(
         False, description="Units of one train may differ in mass: couplers pull both alike, beyond the paper"
     )
@@ -107,7 +107,7 @@ class Params(Table):
     compression_zone_m: float = Field(0.03, gt=0.0, description="delta2, width of the barrier before h2 [m]")
     emergency_distance_m: float = Field(1500.0, gt=0.0, description="le, clear distance that triggers an emergency brake [m]")
     emergency_zone_m: float = Field(600.0, gt=0.0, description="gamma2, width of the barrier before the emergency distance [m]")
-    range_m: float = Field(10000.0, gt=0.0, description="beta, clear distance beyond which trains do not hear each other [m]")
+    range_m: float = Field(10000.0, gt=0.0, description="beta, clear distance beyond which messages do not reach [m]")
     range_zone_m: float = Field(1000.0, gt=0.0, description="gamma1, width over which the weight fades before the range [m]")
 
 

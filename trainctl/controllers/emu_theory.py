@@ -75,7 +75,7 @@ def link_violations(params: Params, scene: Scene) -> list[str]:
     for p, i, desired in zip(links.sender.tolist(), links.receiver.tolist(), links.desired, strict=True):
         ahead, name = scene.trains[p], scene.trains[i]
         if (i, p) not in pairs:
-            found.append(f"link {ahead} to {name}: train {ahead} must hear train {name}, too (the graph is undirected)")
+            found.append(f"link {ahead} to {name}: train {ahead} must receive from train {name}, too (the graph is undirected)")
         if desired < 0.0 and (i, p) in pairs:
             continue  # said once, for the follower
         if desired == 0.0:

@@ -106,7 +106,7 @@ class Params(Table):
     Gains are one number, or lists: of carriages with one per carriage of a train or of all trains, of heads with one per train.
     """
 
-    carriage_l1: Gains = Field(0.1, description="l1, carriages behind the head, eq. (29)")
+    carriage_l1: Gains = Field(0.1, description="l1, carriages behind the leading one, eq. (29)")
     carriage_l2: Gains = Field(0.1, description="l2, eq. (30)")
     carriage_l3: Gains = Field(0.1, description="l3, eq. (31)")
     head_l1_per_s: Gains = Field(0.01, description="ell1 of the heads [1/s]: distances settle with this rate, R3'")
@@ -376,7 +376,7 @@ def _links(params: Params, scene: Scene) -> Iterator[str]:
         if k < 0:
             lower, upper, pair = params.leader_error_lower_m, params.leader_error_upper_m, f"train {train} and the reference"
             if math.isnan(links.slot[i]):
-                yield f"topology.desired: train {train} hears no train ahead and needs a slot behind the reference"
+                yield f"topology.desired: train {train} receives from no train ahead and needs a slot behind the reference"
         else:
             desired = float(links.desired[rows][k])
             lower, upper = float(links.lower[rows][k]) - desired, float(links.upper[rows][k]) - desired

@@ -329,7 +329,7 @@ def _link_violations(scene: Scene) -> Iterator[str]:
         back = rows.get((i, j))
         if back is None:
             mutual = False
-            yield f"{name}: train {scene.trains[j]} must hear train {scene.trains[i]} too, this law needs links both ways"
+            yield f"{name}: train {scene.trains[j]} must receive from train {scene.trains[i]} too, this law needs links both ways"
         elif not np.allclose((d, lower, upper), (-links.desired[back], -links.upper[back], -links.lower[back]), 0.0, ROUNDING):
             yield f"{name}: desired_m, lower_m and upper_m must be the same both ways with the sign changed (Assumption 2.2)"
         if links.weight[row] != 1.0:

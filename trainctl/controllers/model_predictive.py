@@ -101,7 +101,7 @@ class Params(Table):
         description="Full braking every train is sure of, b [m/s2]; default from braking_n and the input's bound.",
     )
     ahead_braking_mps2: float | None = Field(
-        None, gt=0.0, description="Full braking of the train ahead that is reckoned with, b_l [m/s2]; default what it sends."
+        None, gt=0.0, description="Full braking that the train ahead is assumed to have, b_l [m/s2]; default what it sends."
     )
     deceleration_mps2: float = Field(
         1.0, gt=0.0, description="Deceleration asked for where no plan is feasible [m/s2]; full braking, if that is more."

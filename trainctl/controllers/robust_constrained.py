@@ -158,7 +158,7 @@ def _unstable(h: Floats, scene: Scene) -> list[str]:
     strongest = robust_gain.laplacian(len(h), scene.links).diagonal().max()
     return [
         f"topology.weight = {scene.links.weight.max():g}: unstable with h = {h.max():g} and T = {scene.control_period:g} s"
-        f" (spectral radius {radius:.4f}); the weights one train hears with add up to {strongest:g}, Assumption 2 needs less"
+        f" (spectral radius {radius:.4f}); the weights of what one train receives add up to {strongest:g}, Assumption 2 needs less"
         f" than h^2/4 = {h.min() ** 2 / 4:.3g}"
     ]
 
@@ -273,13 +273,13 @@ def warnings(params: Params, scene: Scene, tracks: Sequence[int] | None = None) 
     hears = set(zip(scene.links.receiver.tolist(), scene.links.sender.tolist(), strict=True))
     order = np.lexsort((-position, track))
     deaf = [
-        f"{scene.trains[b]} does not hear {scene.trains[a]}"
+        f"{scene.trains[b]} does not receive from {scene.trains[a]}"
         for a, b in pairwise(order.tolist())
         if track[a] == track[b] and (b, a) not in hears
     ]
     if deaf:
         found.append(
-            f"link: the law has no spacing constraint and not every follower hears its predecessor on the track: {_some(deaf)}; "
+            f"link: the law has no spacing constraint and not every follower receives from its predecessor: {_some(deaf)}; "
             "such graphs can end in a collision from starts that braking would save"
         )
     found += _assumption_1(scene)

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trainctl.numeric import Numeric
 from trainctl.plants import disturbance
 from trainctl.plants.disturbance import END as TABLE_END
 from trainctl.plants.disturbance import START as TABLE_START
@@ -20,7 +19,7 @@ from trainctl.railway import supervisor
 from trainctl.railway.ways import Ways, ways
 from trainctl.scenario.events import Event
 from trainctl.scenario.model import Model
-from trainctl.signals import SPEED, Bounds, Consists, Floats, Formed, Ints, Links, References, Start
+from trainctl.signals import SPEED, Bounds, Consists, Floats, Formed, Ints, Links, References, Seen
 from trainctl.stages.orders import Orders
 from trainctl.stages.record import Journal
 from trainctl.topology import graph
@@ -119,20 +118,15 @@ def stacked(runs: Sequence[Model]) -> Stack:
 
 
 def _model(runs: Sequence[Model]) -> Model:
-    """One model of all trains; ids tell the run, faults are those of each."""
+    """One model of all trains. Where faults name trains, their ids tell the run as well."""
     base = runs[0]
     s = base.scenario
-    train = tuple(t.model_copy(update={"id": f"{r}/{t.id}"}) for r, p in enumerate(runs) for t in p.scenario.train)
+    train = tuple(t for p in runs for t in p.scenario.train)
+    if s.fault:
+        train = tuple(t.model_copy(update={"id": f"{r}/{t.id}"}) for r, p in enumerate(runs) for t in p.scenario.train)
     fault = tuple(f.model_copy(update={"train": f"{r}/{f.train}"}) for r, p in enumerate(runs) for f in p.scenario.fault)
-    scenario = type(s).model_construct(
-        **{
-            **{name: getattr(s, name) for name in type(s).model_fields},
-            "train": train,
-            "fault": fault,
-            "event": (),
-            "disturbance": (),
-        }
-    )
+    tables = {name: getattr(s, name) for name in type(s).model_fields}
+    scenario = type(s).model_construct(**{**tables, "train": train, "fault": fault, "event": (), "disturbance": ()})
     first = base.consists.first
     units = np.concatenate([[0], np.tile(np.diff(first), len(runs))]).cumsum()
     rows = zip(*(p.consists[1:] for p in runs), strict=True)
@@ -149,36 +143,40 @@ def _model(runs: Sequence[Model]) -> Model:
 
 
 def _laid(runs: Sequence[Model]) -> Ways:
-    """The ways of all trains, each laid out once for those that have the same."""
+    """The ways of all trains once the orders at the start are given, each laid out once for those that have the same."""
     line, known = runs[0].line, dict[tuple[str, ...], tuple[Ints, Floats]]()
-    parts = []
-    for p in runs:
-        for route in _routes(p):
+
+    def laid(routes: Sequence[tuple[str, ...]]) -> list[tuple[Ints, Floats]]:
+        for route in routes:
             if route not in known:
                 one = ways([[line.index[e] for e in route]], line.start_m, line.length_m)
                 known[route] = one.edge, one.begin
-            parts.append(known[route])
+        return [known[route] for route in routes]
+
+    parts = []
+    for p in runs:
+        here = laid(p.roster.routes)
+        parts += laid(_ordered(p, _joined(here))) if p.scenario.event else here
+    return _joined(parts)
+
+
+def _joined(parts: Sequence[tuple[Ints, Floats]]) -> Ways:
     first = np.cumsum([0, *(len(edge) for edge, _ in parts)]).astype(np.int64)
     return Ways(first, np.concatenate([edge for edge, _ in parts]), np.concatenate([begin for _, begin in parts]))
 
 
-def _routes(p: Model) -> list[tuple[str, ...]]:
-    """The routes of a run's trains once the orders at its start are given."""
+def _ordered(p: Model, here: Ways) -> list[tuple[str, ...]]:
+    """The routes of a run's trains once the orders at its start are given; ``here`` are their ways before."""
     routes: list[tuple[str, ...]] = list(p.roster.routes)
-    if p.scenario.event:
-        start = Numeric(p.line)
-        start.start(Start(
-            ids=p.scenario.ids, edge=p.roster.edge, lane_position=p.roster.lane_position, speed=p.own[p.leading, SPEED],
-            length=p.consists.train_length(), unit_length=[], routes=routes, present=np.ones(len(routes), bool), vclass=(),
-        ))  # fmt: skip
-        orders = Orders(p, _Unheard())
-        nobody, speed = np.full(len(routes), -1), p.own[p.leading, SPEED]
-        stops_in = supervisor.way_to_stop(
-            p.supervision, p.assumed, speed, np.zeros(len(routes)), p.scenario.run.step_s, p.step_theta
-        )
-        _, given = orders.step(0.0, start.measure(), start.ways, speed, stops_in, nobody, orders.initial())
-        for i, edges in given:
-            routes[i] = edges
+    row, speed, nobody = here.first[:-1], p.own[p.leading, SPEED], np.full(len(routes), -1)
+    seen = Seen(here.begin[row] + p.roster.lane_position, here.edge[row], row, np.ones(len(routes), bool))
+    stops_in = supervisor.way_to_stop(
+        p.supervision, p.assumed, speed, np.zeros(len(routes)), p.scenario.run.step_s, p.step_theta
+    )  # fmt: skip
+    orders = Orders(p, _Unheard())
+    _, given = orders.step(0.0, seen, here, speed, stops_in, nobody, orders.initial())
+    for i, edges in given:
+        routes[i] = edges
     return routes
 
 
@@ -194,10 +192,11 @@ class _Unheard(Journal):
 
 def _links(runs: Sequence[Model], order: Ints, formation: Ints) -> Links:
     """The edge lists of all runs one after the other; ``order`` and ``formation`` (R, n) are those of each run."""
-    each = [
-        p.first_links if np.array_equal(o, p.first_links.order) else graph.links(p.plan, o, f)
-        for p, o, f in zip(runs, order, formation, strict=True)
-    ]
+    each = []
+    for p, o, f in zip(runs, order, formation, strict=True):
+        links = p.first_links  # the same but for the order of the tracks, if the trains of each stand in the same order
+        same = np.array_equal(links.order[np.argsort(f[links.order], kind="stable")], o)
+        each.append(links._replace(order=o) if same else graph.links(p.plan, o, f))
     n = order.shape[1]
     count = np.array([len(links.sender) for links in each])
     shift, rows = np.repeat(n * np.arange(len(runs)), count), np.concatenate([[0], np.cumsum(count)])

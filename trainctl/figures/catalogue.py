@@ -50,8 +50,8 @@ FIGURES: dict[str, Callable[[Drawn], Figure]] = {
     "position_differences": units.position_differences,
     "speed_differences": units.speed_differences,
     "unit_differences": units.unit_differences,
-    "fault_estimates": units.estimates("fault", r"fault [m/s$^3$]"),
-    "acceleration_estimates": units.estimates("acceleration", r"acceleration [m/s$^2$]"),
+    "fault_estimates": units.estimates("fault", "fault [m/s³]"),
+    "acceleration_estimates": units.estimates("acceleration", "acceleration [m/s²]"),
 }
 
 GENERIC = ("train_graph", "positions", "spacing", "spacing_errors", "speeds", "inputs")

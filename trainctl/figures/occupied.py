@@ -67,8 +67,9 @@ class Travelled:
 
 
 def fixed_block(drawn: Drawn) -> bool:
-    """Whether blocks between signals kept the trains of a run apart: SUMO's own, unless its options say moving block."""
-    if drawn.known.law != "sumo":
+    """Whether blocks between signals kept the trains apart: SUMO's own, and those that obey, unless options say moving block."""
+    obeyed = drawn.known.traffic and drawn.run.scenario.get("traffic", {}).get("signals") == "obey"
+    if drawn.known.law != "sumo" and not obeyed:
         return False
     try:
         options = ElementTree.parse(drawn.run.folder / "sumo" / "run.sumocfg").getroot()
@@ -116,7 +117,8 @@ class Occupied:
     def words(self) -> str:
         """What the shades are."""
         if self.blocks:
-            return "Shaded: blocks that trains hold, from a braking distance before their signal until the rear has left them."
+            since = f"a braking distance at {self.rate} m/s² before" if self.rates else "the front is at"
+            return f"Shaded: blocks that trains hold, from when {since} their signal until the rear has left them."
         if not self.length:
             return ""
         return f"Shaded: train{f' and braking distance at {self.rate} m/s²' if self.rates else ''}."
@@ -131,7 +133,7 @@ def occupied(drawn: Drawn) -> Occupied:
     }
     length = {name: float(sum(drawn.known.length_m.get(name, ()))) for name in drawn.trains.names}
     if fixed_block(drawn):
-        return Occupied(blocks=travelled(drawn, way, length))
+        return Occupied(travelled(drawn, way, length), rates=tuple(given.values()))
     return Occupied({}, length, way, tuple(given.values()))
 
 

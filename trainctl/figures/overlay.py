@@ -61,7 +61,10 @@ def overlay(drawn: Sequence[Drawn], names: Sequence[str], what: str) -> Figure:
     else:
         _clip(axes, curves, names)
     absent = [name.replace("_", " ") for one, name in zip(curves, names, strict=True) if not len(one.time)]
-    axes.set_title("; ".join([words, *([f"no links in {', '.join(absent)}"] if absent else [])]), loc="left")
+    axes.set_title(
+        "; ".join([words, *([f"no {'links' if what == 'spacing_errors' else 'trains'} in {', '.join(absent)}"] if absent else [])]),
+        loc="left",
+    )
     relative = what == "positions" and any(one.known.reference is not None for one in drawn)
     axes.set_ylabel(f"{label[:-5]}, less the reference [km]" if relative else label, parse_math=True)
     instants = [one.instants for one in drawn if len(one.instants)]
@@ -139,6 +142,8 @@ def _span(column: Callable[[Drawn], Floats]) -> Callable[[Drawn], Curve]:
         time, table = _of_trains(drawn, column)
         some = np.isfinite(table).any(axis=1)
         time, table = time[some], table[some]
+        if not len(time):
+            return Curve(time, time)
         return Curve(time, np.nanmean(table, axis=1), np.nanmin(table, axis=1), np.nanmax(table, axis=1))
 
     return curve
@@ -171,5 +176,5 @@ QUANTITIES: dict[str, tuple[Callable[[Drawn], Curve], str, str]] = {
     "positions": (_positions, "position [km]", "every train"),
     "spacing_errors": (_worst, r"largest $|x_{ij} - d_{ij}|$ [m]", "the worst link of each run"),
     "speeds": (_span(lambda d: d.trains.column("speed_mps")), "speed [m/s]", "mean, shaded from the slowest to the fastest train"),
-    "inputs": (_span(lambda d: d.trains.column("input_mps2")), r"input [m/s$^2$]", "mean, shaded from the lowest to the highest"),
+    "inputs": (_span(lambda d: d.trains.column("input_mps2")), "input [m/s²]", "mean, shaded from the lowest to the highest"),
 }  # fmt: skip

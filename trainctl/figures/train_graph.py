@@ -165,7 +165,8 @@ def _occupy(
         for low, high, alpha, what in ((front, stand, 0.16, "braking"), (rear, front, 0.55, "body")):
             panel.fill_between(x, low / 1000, high / 1000, color=colour, alpha=alpha, linewidth=0, zorder=1, gid=f"{what} {name}")
     if held.blocks:
-        return [Patch(facecolor=style.GREY, edgecolor=style.GREY, alpha=0.4, label="block held")]
+        since = f"a braking distance before, at {held.rate} m/s²" if held.rates else "its signal on"
+        return [Patch(facecolor=style.GREY, edgecolor=style.GREY, alpha=0.4, label=f"block held (from {since})")]
     found = [Patch(facecolor=style.GREY, alpha=0.7, label="train")] if any(held.length.values()) else []
     if held.rates:
         found.append(Patch(facecolor=style.GREY, alpha=0.3, label=f"braking distance at {held.rate} m/s²"))

@@ -209,7 +209,7 @@ def draw_inputs(panel: Axes, drawn: Drawn) -> None:
     """Draw applied inputs, held until the next row, and bounds into a panel."""
     style.bound(panel, *_distinct(drawn.known.input_mps2.values()))
     _draw_trains(panel, drawn, drawn.trains.column("input_mps2"), drawstyle="steps-post")
-    panel.set_ylabel(r"input [m/s$^2$]", parse_math=True)
+    panel.set_ylabel("input [m/s²]")
 
 
 def speeds_and_inputs(drawn: Drawn) -> Figure:

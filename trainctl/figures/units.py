@@ -122,7 +122,7 @@ def estimates(quantity: str, label: str) -> Callable[[Drawn], Figure]:
         for panel in axes[:2]:
             style.draw(panel, time[rows], true[rows], color=style.COLOURS[0], linewidth=1.6, label=f"truth, unit {name}")
             style.draw(panel, time[rows], guess[rows], **options)
-            panel.set_ylabel(label, parse_math=True)
+            panel.set_ylabel(label)
         begin = _worst_after_start(time[rows], guess[rows] - true[rows]) - ZOOM_S / 3
         inside = (time[rows] >= begin) & (time[rows] <= begin + ZOOM_S)
         both = np.concatenate([true[rows][inside], guess[rows][inside]])
@@ -132,7 +132,7 @@ def estimates(quantity: str, label: str) -> Callable[[Drawn], Figure]:
             axes[1].set_ylim(np.nanmin(both) - spare, np.nanmax(both) + spare)
         axes[1].set_title("where that estimate is worst after the start", loc="right", fontsize=7)
         _bands(axes[2], drawn, guess - true, guess - true, guess - true)
-        axes[2].set_ylabel("error [" + label.partition("[")[2], parse_math=True)
+        axes[2].set_ylabel("error [" + label.partition("[")[2])
         style.focus(axes[2], time, guess - true, guess - true)
         axes[0].set_xlim(drawn.instants[0], drawn.instants[-1])
         return _finished(figure, axes, drawn)

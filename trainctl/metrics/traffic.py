@@ -65,7 +65,7 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
     "fcd.spacing_min_m": (
         "m",
         "FCD log: minimum distance from front to front on one lane (needs pos and lane); of parked vehicles only"
-        " where nobody says when they parked: a stop-output beside the log, or the events of the run.",
+        " where it is not known when they parked: a stop-output beside the log, or the events of the run.",
     ),
     "fcd.spacing_mean_m": ("m", "FCD log: mean of that distance."),
     "fcd.headway_min_s": ("s", "FCD log: minimum spacing over the follower's speed, for vehicles faster than 1 m/s."),

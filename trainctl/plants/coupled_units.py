@@ -53,10 +53,10 @@ class Params(Table):
     """Keys of ``[plant]`` for units with couplers. They act where whole trains are told an acceleration, see ``plants.shared``."""
 
     in_train_stiffness_per_s2: float = Field(
-        6.0, ge=0.0, description="Active part of the coupler stiffness where a train is told an acceleration, per unit mass [1/s2]"
+        6.0, ge=0.0, description="Active part of the coupler stiffness under a law for whole trains, per unit mass [1/s2]"
     )
     in_train_damping_per_s: float = Field(
-        4.0, ge=0.0, description="Active part of the coupler damping where a train is told an acceleration, per unit mass [1/s]"
+        4.0, ge=0.0, description="Active part of the coupler damping under a law for whole trains, per unit mass [1/s]"
     )
 
 

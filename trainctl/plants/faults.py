@@ -29,7 +29,7 @@ class Fault(Table):
     """[[fault]]: one fault of one unit's actuator in one window."""
 
     train: Annotated[int | str, AfterValidator(str)] = Field(description="Id of the train.")
-    unit: int = Field(ge=1, description="Unit of the train, 1 is the head.")
+    unit: int = Field(ge=1, description="Unit of the train, 1 is the leading one.")
     kind: Literal["constant", "sinusoid", "effectiveness"] = Field(
         description="constant: rate amplitude_n_per_s; sinusoid: amplitude_n_per_s cos(omega_rad_per_s t + phase_rad), t from the "
         "start of the run; effectiveness: share of the demanded force that the actuator gives."

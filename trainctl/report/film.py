@@ -49,7 +49,9 @@ def film(run: Run, out: Path, *, seconds: float = 15.0, from_s: float | None = N
     if out.suffix.lower() not in KINDS:
         raise InputError(f"--out {out}: must end in {' or '.join(KINDS)}")
     drawn = drawable(run)
-    data = animation(drawn) if drawn.trains.names else {"time": []}
+    if not drawn.trains.names:
+        raise InputError(f"{run.folder}: no train was recorded")
+    data = animation(drawn)
     if not data["time"]:
         raise InputError(f"{run.folder}: nothing to draw the trains on: a run without SUMO does not know where its net lies")
     times = np.array(data["time"])

@@ -69,7 +69,9 @@ def _events(run: Run, kind: str) -> list[dict[str, Any]]:
     """Events of a kind that run.json counts, at least one."""
     found = [event for event in run.events if event["kind"] == kind]
     if not found:
-        raise InputError(f"{run.folder}: run.json tells of what is no event of kind {kind} in events.jsonl: one of them is damaged")
+        raise InputError(
+            f"{run.folder}: run.json counts what has no event of kind {kind} in events.jsonl: one of the files is damaged"
+        )
     return found
 
 

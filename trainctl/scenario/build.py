@@ -24,7 +24,7 @@ from trainctl.scenario.plan import initial, plan_of
 from trainctl.scenario.reading import examine, mistakes, read
 from trainctl.scenario.reference import Profile
 from trainctl.scenario.tables import Network, Scenario
-from trainctl.signals import POSITION
+from trainctl.signals import POSITION, Floats
 from trainctl.topology import graph
 
 
@@ -125,11 +125,7 @@ def model_of(
         plan=plan, first_links=first, line=None, spec=None, net=None, roster=None,
     )  # fmt: skip
     unfit = fits(model)
-    found += unfit or [
-        *connected(model),
-        *law.violations(params, model.first_scene),
-        *observer.violations(observer_params, model.first_scene),
-    ]  # fmt: skip
+    found += unfit or _start(model)
     if network is not None:
         model = replace(model, line=network[0], spec=network[1], net=network[2])
         slopes = np.column_stack([network[0].gradient.breaks, network[0].gradient.slope])
@@ -157,6 +153,58 @@ def model_of(
     # What it came to is logged, so that a run can go on from its log.
     stated = model.scenario.model_copy(update={"supervisor": model.supervision})
     return replace(model, scenario=stated)
+
+
+def restarted(p: Model, seed: int | None, position: Floats, speed: Floats) -> Model | None:
+    """The run of ``p`` with another seed and other starts, where nothing else follows from them.
+
+    Parameters
+    ----------
+    p : Model
+        A run whose trains [[train]] tables place.
+    seed : int or None
+        ``[run] seed``.
+    position, speed : ndarray, shape (n,)
+        Of every train at the start [m], [m/s].
+
+    Returns
+    -------
+    Model or None
+        None: such a run is not sound, or has to be built by itself (``model_of``, which says what is wrong).
+    """
+    s = p.scenario
+    if not p.placed or s.reference.follow_line or not (np.isfinite(position).all() and (speed >= 0.0).all()):
+        return None
+    trains = zip(s.train, position.tolist(), speed.tolist(), strict=True)
+    train = tuple(t.model_copy(update={"position_m": x, "speed_mps": v}) for t, x, v in trains)
+    scenario = s.model_copy(update={"run": s.run.model_copy(update={"seed": seed}), "train": train})
+    try:
+        plan = plan_of(scenario)
+    except InputError:
+        return None
+    if placing.on_the_line(scenario, p.line):
+        return None
+    own = initial(scenario, p.plant, p.consists)
+    slopes = np.column_stack([p.line.gradient.breaks, p.line.gradient.slope])
+    if slopes[:, 1].any():
+        own = p.plant.balanced(own, p.consists, slopes)
+    track = np.unique([t.track for t in train], return_inverse=True)[1].astype(np.int64)
+    start = own[p.consists.first[int(np.argmin(plan.place))], POSITION] - s.topology.first_slot_m
+    model = replace(
+        p, scenario=scenario, own=own, reference=s.reference.leader(start), plan=plan,
+        first_links=graph.links(plan, graph.order_on_tracks(own[p.leading, POSITION], track), track),
+        roster=roster.placed(scenario, p.line, p.rails),
+    )  # fmt: skip
+    wrong = _start(model) or placing.long_enough(model) or placing.steep(model)
+    if p.supervision.mode != "off":
+        wrong = wrong or can_brake(model) or promise.refusals(model)
+    return None if wrong else model
+
+
+def _start(p: Model) -> list[str]:
+    """What law and observer object to at the start."""
+    scene = p.first_scene
+    return [*connected(p), *p.law.violations(p.params, scene), *p.observer.violations(p.observer_params, scene)]
 
 
 def _params(model: Any, keys: dict[str, Any], table: str) -> Any:

@@ -16,7 +16,7 @@ class Event(Table):
 
     kind: Literal["reroute", "brake", "outage"] = Field(
         description="reroute: the train takes a crossover to another track and stays there. brake: it brakes on its own. outage: "
-        "its radio neither sends nor hears."
+        "its radio neither sends nor receives."
     )
     train: Id = Field(description="The train; an outage may be of all.")
     crossover: str | None = Field(

@@ -42,7 +42,7 @@ def fits(p: Model) -> list[str]:
     found += [*_messages_fit(p), *_disturbances_fit(p)]
     if not p.sampled:
         found += [
-            f"train_type.{name}.force_share = installed: law {p.scenario.controller.law} tells every unit its own force"
+            f"train_type.{name}.force_share = installed: law {p.scenario.controller.law} gives every unit its own force"
             for name, kind in p.scenario.train_type.items() if kind.force_share == "installed"
         ]  # fmt: skip
     horizon = p.law.horizon_s(p.params, p.first_scene) if hasattr(p.law, "horizon_s") else 0.0

@@ -51,9 +51,9 @@ def chosen(
         return "ignore", [], []
     if driving.signals is None and not sumo and bare:
         why = f'though not every train cooperates: no rail signal stands {bare[0]}; give it one, or say signals = "obey"'
-        return "ignore", [f"traffic.signals = ignore: chosen {why} to hear of all such places"], []
+        return "ignore", [f"traffic.signals = ignore: chosen {why} to list all such places"], []
     of = "traffic.signals = obey" if driving.signals else "traffic.others = sumo"
-    wrongs = [f"{of}: no rail signal stands {one}: who goes first there would be decided by nobody" for one in bare]
+    wrongs = [f"{of}: no rail signal stands {one}: nothing would decide who goes first there" for one in bare]
     if driving.signals == "obey" and not signals:
         wrongs.append("traffic.signals = obey: the net has no rail signals")
     if driving.signals or wrongs:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import tempfile
 from pathlib import Path
@@ -95,17 +96,18 @@ def _text(
     except ValueError:
         named = sumocfg.resolve()
     lines = f"""# {len(traffic.departures)} trains of {named}. `trainctl check` says what of its files is followed and what is not.
+#:schema ./trainctl.schema.json
 schema_version = 1
-title = "{named.stem}"
+title = {json.dumps(named.stem)}
 
 [run]
 duration_s = {math.ceil(max(duration, 1.0))}      # until the last train may have arrived
 
 [network]
-sumocfg = "{named.as_posix()}"      # trains, routes, stops and tracks come from its files
+sumocfg = {json.dumps(named.as_posix())}      # trains, routes, stops and tracks come from its files
 
 [reference]
-speed_mps = {cruise:g}      # cruising speed, the highest that any type and track here allow; nobody runs above his own limits
+speed_mps = {cruise:g}      # cruising speed, the highest that any type and track here allow; no train exceeds its own limits
 
 [traffic]
 cooperate = ["*"]      # ids of the trains that join formations; [] for none: every train is driven by itself

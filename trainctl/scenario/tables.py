@@ -121,7 +121,7 @@ class TrafficTable(Table):
     join_band_m: Positive = Field(50.0, description="A train joins once its spacing is right within this, and in its bounds [m].")
     join_band_mps: Positive = Field(0.5, description="... and its speed that of the formation within this [m/s].")
     wait_limit_s: Positive = Field(
-        600.0, description="Waiting for another train, a switch or its entry, but not at its own stop, is told beyond this [s]."
+        600.0, description="Waiting for another train, a switch or its entry, but not at its own stop, is logged beyond this [s]."
     )
 
 
@@ -140,7 +140,7 @@ class Topology(Table):
     """[topology]: who hears whom, at which spacing."""
 
     rule: Literal["same_track", "links"] = Field(
-        "same_track", description="same_track: neighbours on the same track hear each other; links: just the [[link]] tables."
+        "same_track", description="same_track: neighbours on one track receive from each other; links: just the [[link]] tables."
     )
     desired: Literal["slots", "equal"] = Field(
         "slots",
@@ -164,9 +164,9 @@ class Topology(Table):
 class Link(Table):
     """[[link]]: states one link's numbers; also makes the link where rule = "links" or extra = true."""
 
-    between: tuple[Id, Id] | None = Field(None, description="Two trains, the one ahead first, that hear each other.")
+    between: tuple[Id, Id] | None = Field(None, description="Two trains, the one ahead first, that receive from each other.")
     sender: Id | None = Field(None, description="With receiver, instead of between: a link in one direction.")
-    receiver: Id | None = Field(None, description="The train that hears.")
+    receiver: Id | None = Field(None, description="The train that receives.")
     desired_m: float | None = Field(None, description="Desired x_first - x_second (sender - receiver) [m]; default from the slots.")
     lower_m: float | None = Field(None, description="Minimum spacing [m]; default the sum over the consecutive links it spans.")
     upper_m: float | None = Field(None, description="Maximum spacing [m]; default the sum over the consecutive links it spans.")
@@ -210,7 +210,7 @@ class TrainType(Table):
     actuator_rate_per_s: PerUnit = Field(0.0, description="r of the actuator tau' = -r tau + r demand [1/s] (actuated_units).")
     force_share: Literal["mass", "installed"] | None = Field(
         None,
-        description="How the units share a train's force where a law tells whole trains an acceleration. mass, the default: each"
+        description="How the units share a train's force under a law for whole trains. mass, the default: each"
         " carries its own mass, couplers stay at rest; installed: each gives the same part of its traction_n or braking_n (0: a"
         " trailer), and couplers carry the difference.",
     )

@@ -199,7 +199,7 @@ class Orders:
         cure = '[supervisor] mode = "on" does'
         if over.speed_mps < speed[i]:
             raise Refused(
-                f"crossover {over.id} allows {over.speed_mps:g} m/s, the train runs at {speed[i]:g} m/s, and nobody would brake it:"
+                f"crossover {over.id} allows {over.speed_mps:g} m/s, the train runs at {speed[i]:g} m/s and nothing would brake it:"
                 f" {cure}"
             )
         join = over.start_m + over.length_m
@@ -211,7 +211,7 @@ class Orders:
             j = int(meets[0])
             raise Refused(
                 f"train {self.p.scenario.ids[j]} would be at the join of crossover {over.id} at {join:.1f} m at the same time, and"
-                f" nobody would keep them apart: {cure}"
+                f" nothing would keep them apart: {cure}"
             )
 
     def _to_an_edge(self, event: Event, i: int, seen: Seen, ways: Ways, lock: float) -> tuple[tuple[str, ...], dict[str, Any]]:

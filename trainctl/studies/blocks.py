@@ -75,8 +75,11 @@ def simulate_block(block: Batch) -> Part:
     for job in jobs:
         model: Model | None = None
         try:
-            model = job_model(job, models[0] if models else None)
-            reason = alone(model) or (None if not models or kind(model) == kind(models[0]) else "it is unlike the others")
+            model = job_model(job, like=models[0] if models else None)
+            if models and model.params is models[0].params:  # made from that one: seed and starts are all that differs
+                reason = None
+            else:
+                reason = alone(model) or (None if not models or kind(model) == kind(models[0]) else "it is unlike the others")
         except InputError:
             reason = "its start is refused"
         except Exception as error:  # its own run tells it

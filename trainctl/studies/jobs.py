@@ -9,12 +9,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from trainctl.errors import InputError, TrainctlError
 from trainctl.scenario.reading import examine
 from trainctl.studies.results import COUNTS
 
 if TYPE_CHECKING:
     from trainctl.scenario.model import Model
+
+#: Jitter of these moves starts and changes nothing else.
+STARTS = {"train.position_m", "train.speed_mps"}
 
 #: libsumo holds one simulation per process, and a worker may have several threads.
 ONE_SIMULATION = threading.Lock()
@@ -61,12 +66,27 @@ class Batch(NamedTuple):
         return Batch(self.job, [self.numbers[k] for k in places], [self.seeds[k] for k in places])
 
 
-def job_model(job: Job, beside: Model | None = None) -> Model:
-    """The run's scenario as arrays, its starts moved by the jitter; ``beside`` as in ``model_of``."""
-    from trainctl.scenario.build import model_of
+def job_model(job: Job, beside: Model | None = None, like: Model | None = None) -> Model:
+    """The run's scenario as arrays, its starts moved by the jitter.
+
+    Parameters
+    ----------
+    job : Job
+        The run.
+    beside : Model, optional
+        As in ``model_of``.
+    like : Model, optional
+        A run of the same batch: what does not follow from seed and starts is taken from it.
+    """
+    from trainctl.scenario.build import model_of, restarted
 
     tables = {**job.tables, "train": [dict(train) for train in job.tables.get("train", [])]}
     _move(tables, job.jitter)
+    if like is not None and job.jitter.keys() <= STARTS:
+        place, speed = (np.array([train[key] for train in tables["train"]], float) for key in ("position_m", "speed_mps"))
+        if (model := restarted(like, tables["run"]["seed"], place, speed)) is not None:
+            return model
+        beside = like
     scenario, found = examine(tables)
     if scenario is None:
         raise InputError([f"{job.file}: {line}" for line in found])
@@ -75,8 +95,6 @@ def job_model(job: Job, beside: Model | None = None) -> Model:
 
 def _move(tables: dict[str, Any], jitter: Mapping[str, float]) -> None:
     """Add each train's deviation: a function of the seed, the key and the train's id."""
-    import numpy as np
-
     from trainctl import draws
 
     ids = [draws.word(str(train["id"])) for train in tables["train"]]

@@ -33,9 +33,11 @@ def told(net: NetFile, routes: Iterable[tuple[str, ...]]) -> list[str]:
     tracks = _tracks(net, {e for route in routes for e in route})
     lines = []
     if on := _on_junctions(net, tracks, {pair for route in routes for pair in pairwise(route)}):
-        lines.append(f"net: tracks cross on {_some(on)} without edges inside: nobody keeps trains apart there")
+        lines.append(f"net: tracks cross on {_some(on)} without edges inside: nothing keeps trains apart there")
     if between := _between(tracks):
-        lines.append(f"net: tracks cross without a junction at {_some(between)}: nobody keeps trains apart there; fine for bridges")
+        lines.append(
+            f"net: tracks cross without a junction at {_some(between)}: nothing keeps trains apart there; fine for bridges"
+        )
     return lines
 
 

@@ -207,8 +207,8 @@ def test_missing_slots_and_one_way_links_are_told() -> None:
         sender=np.array([0, 1]), receiver=np.array([1, 2]), first=np.array([0, 0, 1, 2]), desired=np.array([3320.0, 3320.0])
     )
     assert law.violations(Params(), s._replace(links=one_way)) == [
-        "link 1 to 2: train 1 must hear train 2, too (the graph is undirected)",
-        "link 2 to 3: train 2 must hear train 3, too (the graph is undirected)",
+        "link 1 to 2: train 1 must receive from train 2, too (the graph is undirected)",
+        "link 2 to 3: train 2 must receive from train 3, too (the graph is undirected)",
     ]
 
 

@@ -246,7 +246,7 @@ def test_links_must_go_both_ways_alike_and_have_no_weights() -> None:
         first=np.array([0, 0, 1]), **{k: getattr(sc.links, k)[1:] for k in ("sender", "receiver", "desired", "lower", "upper")},
         weight=np.ones(1), heard=np.ones(1, bool),
     )  # fmt: skip
-    assert said(sc._replace(links=one_way)) == "link[1,2]: train 1 must hear train 2 too, this law needs links both ways"
+    assert said(sc._replace(links=one_way)) == "link[1,2]: train 1 must receive from train 2 too, this law needs links both ways"
     odd = sc.links._replace(upper=sc.links.upper + np.array([0.0, 1.0]))
     assert "the same both ways" in said(sc._replace(links=odd))
     assert "weight = 0.5" in said(sc._replace(links=sc.links._replace(weight=np.full(2, 0.5))))

@@ -185,7 +185,7 @@ def test_trains_on_other_tracks_are_formations_of_their_own() -> None:
 def test_warns_of_followers_that_do_not_hear_their_predecessor() -> None:
     against = [(1, 0), (2, 1), (3, 2), (0, 3)]
     (found,) = law.warnings(PARAMS, scene(against))
-    assert "2 does not hear 1; 3 does not hear 2; 4 does not hear 3" in found
+    assert "2 does not receive from 1; 3 does not receive from 2; 4 does not receive from 3" in found
     assert "no spacing constraint" in found
     assert law.warnings(PARAMS, scene([(0, 1), (1, 2), (2, 3), (3, 0)])) == []
     assert law.warnings(PARAMS, scene([(0, 1), (1, 0), (2, 3), (3, 2)]), tracks=[1, 1, 2, 2]) == []

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
+import nets
 import numpy as np
 import pytest
+import tomli_w
 
 from trainctl.figures import catalogue
+from trainctl.figures.corridors import corridors
 from trainctl.figures.occupied import Travelled, along, braking, fixed_block, occupied
 from trainctl.figures.trains import drawable
 from trainctl.report.panels import panels
@@ -129,3 +133,25 @@ def test_what_a_train_surely_brakes_with(finished: Callable[..., Run]) -> None:
 def test_which_way_a_front_runs() -> None:
     assert along(np.array([np.nan, 3.0, 3.0, 4.0, 4.0, 3.0, 3.0])).tolist() == [1, 1, 1, 1, 1, -1, -1]
     assert along(np.array([2.0, 2.0])).tolist() == [1, 1]
+
+
+def test_trains_that_obey_signals_hold_the_blocks_of_a_net(tmp_path: Path) -> None:
+    places = {"w0": (-3000, 0), "w": (0, 0), "s0": (-3000, -3000), "s": (0, -3000), "m": (4000, 0), "x": (6000, 0), "e": (12000, 0)}
+    edges = {
+        "west0": ("w0", "w"), "west": ("w", "m"), "south0": ("s0", "s"), "south": ("s", "m"), "main": ("m", "x"), "east": ("x", "e"),
+    }  # fmt: skip
+    nets.net(tmp_path, places, edges, signals="wsmx")
+    nets.traffic(tmp_path, nets.train("a", "west0 west main east", 0) + nets.train("b", "south0 south main east", 30))
+    made = nets.scenario("robust_constrained", 500, traffic={"cooperate": [], "signals": "obey"})
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(made))
+    drawn = drawable(run(open_scenario(str(tmp_path / "s.toml")), tmp_path / "r"))
+    assert fixed_block(drawn)
+    found, _ = corridors(drawn.run, drawn.trains)
+    west = next(corridor for corridor in found if "a" in corridor.distance and len(corridor.places))
+    at = {place.name: place.at_m for place in west.places}
+    held = {name: occupied(drawn).blocks[name].on(west.distance[name]) for name in west.distance}
+    main = {name: next(b for b in blocks if abs(b.from_m - at["m"]) < 60.0) for name, blocks in held.items()}
+    assert all(block.to_m - block.from_m == pytest.approx(2000.0, abs=40.0) for block in main.values())
+    assert main["a"].end_s <= main["b"].begin_s + 2.0  # SUMO gives it free in the step in which the rear has left
+    words = next(p["note"] for p in panels(drawn) if p["id"] == "graph")
+    assert "blocks that trains hold, from when a braking distance at 0.7 m/s² before their signal" in words

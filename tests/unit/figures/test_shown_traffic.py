@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.colors import to_hex
+from matplotlib.text import Text
 
 from trainctl.cli import program as cli
 from trainctl.errors import InputError
@@ -285,3 +286,13 @@ def test_a_station_near_the_entry_is_not_overrun(tmp_path, place):
     done = run(open_scenario(str(tmp_path / "s.toml"), {"run.duration_s": 160}), tmp_path / "r", "numeric")
     (stop,) = [e for e in done.events if e["kind"] == "stop_reached"]
     assert (stop["train"], abs(stop["short_m"]) < 2.0) == ("stopping", True)
+
+
+@pytest.mark.parametrize("name", sorted(catalogue.FIGURES))
+def test_no_figure_shows_the_signs_of_a_formula(name, merging):
+    """Words are text; a formula says so."""
+    try:
+        figure = catalogue.figure(merging, name)
+    except InputError:
+        return  # nothing recorded for it
+    assert [text.get_text() for text in figure.findobj(Text) if "$" in text.get_text() and not text.get_parse_math()] == []

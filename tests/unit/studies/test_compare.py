@@ -206,3 +206,14 @@ def test_gains_are_stated_and_who_is_left_out(own, monkeypatch, capsys):
     assert "time_headway: time_headway on coupled_units: gain_per_s = 0.2" in done.stdout
     assert "my_law: my_law.py on coupled_units" in done.stdout and "slow_law: " in done.stdout
     assert "sliding_mode is left out: own.toml: controller.reach_mps2 = 5: unstable" in done.stdout
+
+
+def test_a_run_in_which_no_train_came_is_named(runs, tmp_path):
+    folder = tmp_path / "nobody"
+    shutil.copytree(runs[1].folder, folder)
+    for table_of in ("trains", "links"):
+        rows = pq.read_table(folder / f"{table_of}.parquet")
+        pq.write_table(rows.slice(0, 0), folder / f"{table_of}.parquet")
+    drawn = [drawable(runs[0]), drawable(Run(folder))]
+    titles = {what: overlay(drawn, ["one", "nobody_there"], what).axes[0].get_title(loc="left") for what in QUANTITIES}
+    assert titles["speeds"].endswith("no trains in nobody there") and titles["spacing_errors"].endswith("no links in nobody there")

@@ -282,3 +282,24 @@ def test_a_law_that_takes_one_run_alone_gets_them_one_by_one(here, tmp_path, mon
     info = sweep(SweepPlan("fully_distributed", SHORT, range(20), {}, "numeric"), tmp_path / "a", workers=1)
     assert info["complete"] == 20
     assert info["alone"] == {"ValueError: six trains are the most": 20}
+
+
+def test_a_run_like_another_is_the_one_it_is_by_itself():
+    """All that is in the model, and a start that is not sound is told in the words of its own reading."""
+    (batch,) = sweeping.batches(SweepPlan(MANY.scenario, {"topology.loss": [0.2]}, range(4), {"train.speed_mps": 4.0}, "numeric"))
+    jobs = batch.each()
+    like = job_model(jobs[0])
+    for job in jobs[1:]:
+        one, other = job_model(job, like=like), job_model(job)
+        assert one.scenario == other.scenario
+        for name in ("own", "bounds", "reference", "plan", "first_links", "consists", "clamps"):
+            assert repr(getattr(one, name)) == repr(getattr(other, name)), name
+        assert one.roster.edge.tolist() == other.roster.edge.tolist() and one.roster.routes == other.roster.routes
+        assert one.radio.key.tolist() == other.radio.key.tolist() != like.radio.key.tolist()
+    wild = jobs[1]._replace(jitter={"train.position_m": 9000.0})
+    told = []
+    for way in ({}, {"like": like}):
+        with pytest.raises(InputError) as refused:
+            job_model(wild, **way)
+        told.append(refused.value.mistakes)
+    assert told[0] == told[1]
