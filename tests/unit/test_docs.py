@@ -70,6 +70,8 @@ REPLACED: dict[str, tuple[str | None, str]] = {
         "trainctl run fault_tolerant_noise --backend numeric --set run.duration_s=10 --out runs/fault_tolerant_noise", "160 s take too long"),
     "trainctl run robust_three_tracks": ("trainctl run robust_three_tracks --set run.duration_s=24 --out runs/robust_three_tracks", "quicker"),
     "trainctl compare capacity": (None, "three minutes; tests/unit/studies/test_capacity.py runs it"),
+    "trainctl compare spacing": ("trainctl compare spacing --rows sliding_mode --stops 3 --searched 2", "all laws take ten minutes"),
+    "trainctl compare suite": ("trainctl compare suite --rows relative_braking --runs 2", "all laws take minutes"),
     "trainctl run my_law/my_law.toml": ("trainctl run my_law/my_law.toml --set run.duration_s=24", "2400 s take too long"),
     "python -m pytest my_law": (None, "test_new.py runs these tests"),
     "sumo-gui -n nets/three_tracks.net.xml": ("sumo -n nets/three_tracks.net.xml -e 1", "no screen"),

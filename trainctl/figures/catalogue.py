@@ -136,6 +136,7 @@ def _captioned(figure: Figure, drawn: Drawn, wanted: bool) -> Figure:
     if wanted:
         words = textwrap.fill(drawn.origin, 150 if drawn.width == "double" else 70)
         figure.supxlabel(words, x=0.01, ha="left", fontsize=6, color=style.GREY)
+    style.written_out(figure)
     return figure
 
 

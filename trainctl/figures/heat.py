@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 ACROSS = 3
 #: Cells of one map at most that have their numbers in them, and values on an axis that all have their ticks.
 NUMBERED, TICKS = 64, 9
+#: Values that differ by less are one value.
+ROUNDING = 1e-6
 #: How cells without a value are told apart: of no complete run, of runs of which most did not settle.
 EMPTY, NEVER = "no complete run", "most runs not settled"
 
@@ -103,6 +105,7 @@ def _cells(value: Floats, cell: Any, runs: Any, gather: Callable[[Floats], Any])
 
 def _map(panel: Axes, value: Floats, late: Bools, across: Floats, up: Floats, label: str) -> None:
     """One map with its colour bar; margins to bounds are red where a bound is violated."""
+    value = np.where(np.abs(value) < ROUNDING, 0.0, value)
     some = value[np.isfinite(value)]
     low, high = (float(some.min()), float(some.max())) if len(some) else (0.0, 1.0)
     if label.startswith("share"):
@@ -111,7 +114,9 @@ def _map(panel: Axes, value: Floats, late: Bools, across: Floats, up: Floats, la
         reach = max(-low, high)
         colours, norm = "RdBu", TwoSlopeNorm(0.0, -reach, reach)
     else:
-        colours, norm = "cividis", Normalize(low, high if high > low else low + 1.0)
+        colours, norm = "cividis", Normalize(low, high)
+    if high - low < ROUNDING and not label.startswith("share"):  # one value: no scale
+        colours, norm = ("RdBu", Normalize(-1.0, 1.0)) if low < 0.0 else ("Greys", Normalize(low - 0.2, low + 1.0))
     drawn = panel.pcolormesh(np.arange(len(across) + 1), np.arange(len(up) + 1), value, cmap=colours, norm=norm)
     for (j, k), number in np.ndenumerate(value):
         if not np.isfinite(number):
@@ -127,9 +132,10 @@ def _map(panel: Axes, value: Floats, late: Bools, across: Floats, up: Floats, la
     panel.set_yticks(*_ticks(up))
     panel.grid(False)
     panel.set_title(label.replace("\n", " "), loc="left", fontsize=7)
-    bar = panel.figure.colorbar(drawn, ax=panel, pad=0.02, aspect=14)
-    bar.ax.tick_params(labelsize=6)
-    bar.outline.set_linewidth(0.4)
+    if len(some) and (high - low >= ROUNDING or label.startswith("share")):
+        bar = panel.figure.colorbar(drawn, ax=panel, pad=0.02, aspect=14)
+        bar.ax.tick_params(labelsize=6)
+        bar.outline.set_linewidth(0.4)
 
 
 def _ticks(values: Floats) -> tuple[Any, list[str]]:

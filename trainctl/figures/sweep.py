@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from trainctl.figures import style
-from trainctl.figures.heat import heat, two_settings
+from trainctl.figures.heat import ROUNDING, heat, two_settings
 from trainctl.signals import Bools
 
 if TYPE_CHECKING:
@@ -30,15 +30,14 @@ SHOWN = {
 
 SETTLING = "formation.settling_s"
 
-#: Values that differ by less are one value, and no axis is stretched over it.
-ROUNDING = 1e-6
-
 
 def not_settled(done: pd.DataFrame) -> Bools:
     """Which of the complete runs have links that did not stay within their band, shape (runs,)."""
-    if SETTLING not in done.columns or "formation.final_error_m" not in done.columns:
+    if "formation.final_error_m" not in done.columns:
         return np.zeros(len(done), dtype=np.bool_)
-    out: Bools = np.isnan(done[SETTLING].to_numpy(float)) & np.isfinite(done["formation.final_error_m"].to_numpy(float))
+    # Where no run settled the dataset has no such column.
+    since = done[SETTLING].to_numpy(float) if SETTLING in done.columns else np.full(len(done), np.nan)
+    out: Bools = np.isnan(since) & np.isfinite(done["formation.final_error_m"].to_numpy(float))
     return out
 
 
@@ -72,6 +71,7 @@ def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
     missing = frame["status"].value_counts().drop("complete", errors="ignore").sort_index()
     runs = f"{len(done)} of {len(frame)} runs complete, {', '.join(f'{n} {status}' for status, n in missing.items())}"
     unsettled = not_settled(done)
+    done = done if SETTLING in done.columns else done.assign(**{SETTLING: np.nan})
     shown = [key for key in SHOWN if key in done.columns and np.isfinite(done[key].to_numpy(float)).any()]
     if unsettled.any() and SETTLING not in shown:
         shown = [key for key in SHOWN if key in (*shown, SETTLING)]

@@ -96,6 +96,7 @@ def _pictures(data: dict[str, Any], times: Floats, wanted: Floats, title: str) -
         axes.annotate(train["name"], (0, 0), xytext=(6, 6 if k % 2 else -12), textcoords="offset points", fontsize=7, animated=True)
         for k, train in enumerate(data["trains"]) if count <= NAMED
     ]  # fmt: skip
+    style.written_out(figure)
     canvas.draw()
     ground = canvas.copy_from_bbox(figure.bbox)
     found = []

@@ -14,6 +14,7 @@ from sumo_net.shapes import Piece, shapes
 from trainctl.errors import InputError
 from trainctl.figures.trains import Drawn
 from trainctl.report.panels import packed
+from trainctl.runs.run import check_size
 from trainctl.runs.series import INSTANT
 from trainctl.signals import Floats
 
@@ -46,10 +47,14 @@ def on_the_map(drawn: Drawn, times: Floats) -> dict[str, Any] | None:
         return None
     try:
         pieces = shapes(nets[0], set(drawn.run.trains.edge.astype(str)))
-        seen = pd.DataFrame(pq.read_table(log, columns=list(COLUMNS)).to_pandas()).rename(columns=COLUMNS)
+        with pq.ParquetFile(log) as file:
+            check_size(log, file)
+            seen = pd.DataFrame(file.read(columns=list(COLUMNS)).to_pandas()).rename(columns=COLUMNS)
+        for name in ("time_s", "x", "y"):
+            seen[name] = pd.to_numeric(seen[name])
     except LineError as error:
         raise InputError(error.mistakes) from None
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{log}: cannot be read: {str(error).partition(chr(10))[0]}") from None
     stops = _stops(drawn, seen, pieces)
     number = {name: k for k, name in enumerate(drawn.trains.names)}
@@ -57,8 +62,8 @@ def on_the_map(drawn: Drawn, times: Floats) -> dict[str, Any] | None:
     frame = np.clip(np.searchsorted(times, seen["time_s"].to_numpy() - INSTANT), 0, len(times) - 1)
     shown = np.abs(times[frame] - seen["time_s"].to_numpy()) < INSTANT
     seen, frame = seen[shown], frame[shown]
-    train = seen["train"].map(number).to_numpy()
-    edges = seen["lane"].astype(str).str.rpartition("_")[0].astype("category")
+    train = seen["train"].map(number).to_numpy(dtype=np.int64)
+    edges = seen["lane"].astype(str).str.replace("_[^_]*$", "", regex=True).astype("category")
     grids = []
     for values in (seen["x"], seen["y"], edges.cat.codes):
         grid = np.full((len(times), len(number)), np.nan)

@@ -29,6 +29,7 @@ import tomli_w
 from trainctl.errors import InputError, LawError
 from trainctl.railway.supervisor import stopping_distance
 from trainctl.signals import POSITION, SPEED
+from trainctl.stages.record import Record
 from trainctl.studies.capacity import ICE3, LAW_ROWS
 from trainctl.studies.results import wilson
 
@@ -187,8 +188,29 @@ class Silent:
     def event(self, time: float, kind: str, **fields: Any) -> None:
         """Not kept."""
 
-    def write(self, row: Any) -> None:
-        """Not kept."""
+
+class Unwatched(Record):
+    """Of stops side by side nothing is recorded, and no alarm is raised: ``Watch`` looks."""
+
+    def relinked(self, t: float, scene: Any, formed: Any, s: Any) -> None:
+        """Nobody is told."""
+
+    def tell(self, row: Any, ways: Any, here: Any, due: bool, s: Any) -> None:
+        """Nobody is told."""
+
+    def waits(self, t: float, here: Any, speed: Any, traffic: Any, around: Any, due: Any, s: Any) -> None:
+        """Nobody waits."""
+
+
+def unwatched(p: Model) -> Loop:
+    """The closed loop of a scenario without a simulator, of which nothing is kept."""
+    from trainctl.loop import Loop
+    from trainctl.numeric import Numeric
+
+    journal = cast("Journal", Silent())
+    loop = Loop(p, Numeric(p.line), journal)
+    loop.record = Unwatched(p, journal)
+    return loop
 
 
 def prepared(plan: StopsPlan, row: str, spacing: float, stops: Sequence[int], folder: Path) -> Model:
@@ -204,15 +226,12 @@ def prepared(plan: StopsPlan, row: str, spacing: float, stops: Sequence[int], fo
 
 def stopped(plan: StopsPlan, row: str, spacing: float, stops: Sequence[int], folder: Path) -> tuple[Outcome, Loop | None]:
     """Run these stops side by side; what came of them, and the loop at its end."""
-    from trainctl.loop import Loop
-    from trainctl.numeric import Numeric
-
     try:
         p = prepared(plan, row, spacing, stops, folder)
     except InputError as error:
         return Outcome(spacing, REFUSED, 0, len(stops), 0, math.inf, error.mistakes[0].partition(": ")[2]), None
-    loop = Loop(p, Numeric(p.line), cast("Journal", Silent()))
-    watch = _Watch(plan, p, len(stops))
+    loop = unwatched(p)
+    watch = Watch(plan, p, len(stops))
     try:
         while not loop.over and not watch.over(loop):
             loop.step()
@@ -238,7 +257,7 @@ def in_sumo(plan: StopsPlan, row: str, spacing: float, stops: Sequence[int], fol
     return _outcome(spacing, stops, gap < 0.0, (gap < 0.0) | (speed > plan.line_mps + ROUNDING_MPS), float(gap.min()))
 
 
-class _Watch:
+class Watch:
     """Gaps and speeds of all stops, step by step; trains are rows, ``trains`` of them for each stop, the first one first."""
 
     def __init__(self, plan: StopsPlan, p: Model, stops: int) -> None:

@@ -17,7 +17,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import tomli_w
@@ -27,12 +27,11 @@ from trainctl.record.folder import write_json
 from trainctl.signals import POSITION, SPEED
 from trainctl.studies.capacity import BAND_MPS, LAW_ROWS
 from trainctl.studies.results import wilson
-from trainctl.studies.stops import REFUSED, ROUNDING_MPS, ROWS, Silent, StopsPlan, scenario
+from trainctl.studies.stops import REFUSED, ROUNDING_MPS, ROWS, StopsPlan, scenario, unwatched
 
 if TYPE_CHECKING:
     from trainctl.loop import Loop
     from trainctl.signals import Floats
-    from trainctl.stages.record import Journal
 
 Tables = dict[str, Any]
 
@@ -181,8 +180,6 @@ def tables_of(plan: SuitePlan, row: str, situation: str) -> tuple[Tables, Tables
 
 def cell(plan: SuitePlan, row: str, situation: str, folder: Path) -> Cell:
     """Run a cell; its files lie in ``folder``."""
-    from trainctl.loop import Loop
-    from trainctl.numeric import Numeric
     from trainctl.scenario.build import open_scenario
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -194,7 +191,7 @@ def cell(plan: SuitePlan, row: str, situation: str, folder: Path) -> Cell:
         p = open_scenario(str(file))
     except InputError as error:
         return Cell(row, situation, REFUSED, error.mistakes[0].partition(": ")[2], 0, plan.runs, None, None, None)
-    loop = Loop(p, Numeric(p.line), cast("Journal", Silent()))
+    loop = unwatched(p)
     of = np.array([int(name.partition(".")[0]) for name in p.scenario.ids])
     gap, fast, speeds = np.full(plan.runs, np.inf), np.zeros(plan.runs, bool), list[Any]()
     try:

@@ -56,7 +56,7 @@ def renamed(value, names):
 def whole(tmp_path_factory) -> Path:
     """A run of trains that come and stop, not yet hostile."""
     folder = tmp_path_factory.mktemp("whole") / "run"
-    run(open_scenario("merging", {"run.duration_s": 240, "run.record_every_s": 4.0}), folder, "numeric", command_line=["x"])
+    run(open_scenario("merging", {"run.duration_s": 240, "run.record_every_s": 4.0}), folder, "sumo", command_line=["x"])
     return folder
 
 
@@ -110,6 +110,9 @@ LOOKS = {
     "diff RUN RUN --rows": (0,),
     "compare RUN WHOLE --out out": (0,),
     "golden make RUN kept": (0,),
+    "golden check RUN WHOLE": (1,),
+    "film RUN --out film.gif --seconds 1": (0, 2),
+    "replay RUN --gui-program sumo": (0, 2),
     "resume RUN": (0,),
 }
 
@@ -128,7 +131,7 @@ def test_a_hostile_folder_is_only_looked_at(line, hostile, whole, monkeypatch, c
     (place / "inside").mkdir()
     before = set(hostile.rglob("*"))
     words = {"RUN": str(hostile), "WHOLE": str(whole)} | {
-        w: str(place / "inside" / w) for w in ("out", "page.html", "junit.xml", "kept")
+        w: str(place / "inside" / w) for w in ("out", "page.html", "junit.xml", "kept", "film.gif")
     }
     code = typed(" ".join(words.get(word, word) for word in line.split()), monkeypatch)
     told = capsys.readouterr()
@@ -183,6 +186,27 @@ def test_wrong_fields_are_refused_in_words_by_every_reader(file, key, value, who
         told = capsys.readouterr().err
         assert code in (0, 1, 2), line
         assert code != 2 or (told.count("\n") == 1 and str(folder) in told), f"{line}: {told}"
+
+
+@pytest.mark.parametrize("damage", ["cut", "text", "columns", "none"])
+def test_a_damaged_log_of_sumo_is_refused_or_left_out_by_the_page(damage, whole, tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "run"
+    shutil.copytree(whole, folder)
+    log = folder / "sumo/fcd.parquet"
+    if damage == "cut":
+        log.write_bytes(log.read_bytes()[:-100])
+    elif damage == "none":
+        pq.write_table(pq.read_table(log).slice(0, 0), log)
+    else:
+        table = pq.read_table(log)
+        k = table.column_names.index("vehicle_x")
+        table = (
+            table.remove_column(k) if damage == "columns" else table.set_column(k, "vehicle_x", pa.array(["x"] * table.num_rows))
+        )
+        pq.write_table(table, log)
+    monkeypatch.chdir(tmp_path)
+    code, told = typed(f"report {folder} --out page.html", monkeypatch), capsys.readouterr().err
+    assert (code, told.count("\n")) == ((0, 0) if damage == "none" else (2, 1)), told
 
 
 # Bombs

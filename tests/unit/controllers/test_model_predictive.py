@@ -70,6 +70,22 @@ def test_a_feasible_plan_keeps_every_constraint(spacing, v, v_l, steps, seed) ->
     assume(feasible)
 
 
+def test_the_margin_is_kept_over_the_whole_horizon() -> None:
+    """A train that minds nothing but changes of its acceleration would run on; the one ahead has planned to brake."""
+    lazy = law.Params(spacing_weight=1e-9, speed_weight=1e-9, acceleration_weight=1e-9, change_weight=1.0)
+    string = String(law, lazy, scene(2, 400.0))
+    string.own = np.array([[0.0, 10.0], [-260.0, 10.0]])
+    memory = string.memory[0]._replace(speed=string.own[:, 1].copy())
+    heard = law.message(string.constants, state(string.own), string.leader(), memory)[string.scene.links.sender]
+    heard[string.constants.who.row[1], ahead.SAID + 1 :] = -0.3
+    own, links = state(string.own), string.scene.links
+    found, after = law.demand(string.constants, own, string.leader(), links, heard, memory)
+    v, v_l = (10.0 + np.cumsum(a) for a in (after.plan[1], np.full(N, -0.3)))
+    spacing = 260.0 + np.cumsum(np.concatenate(([10.0], v_l[:-1])) - np.concatenate(([10.0], v[:-1])))
+    assert not found.saturated[1]
+    assert spacing.min() == pytest.approx(LENGTH_M + lazy.margin_m, abs=1e-6)
+
+
 def test_where_nothing_is_feasible_a_train_brakes_fully_and_says_so() -> None:
     string = String(law, P, scene(2, 400.0))
     string.own[1, 0] = -(LENGTH_M + 5.0)  # within the margin already

@@ -82,3 +82,18 @@ def test_a_map_shows_what_did_not_settle_and_what_gave_nothing(tmp_path: Path) -
     frame.loc[6:, "status"] = "failed"
     text = drawn(frame, tmp_path)
     assert "no complete run" in text and "6 of 8 runs complete, 2 failed; median of 2 runs per cell" in text
+
+
+def test_where_no_run_settled_it_is_said(tmp_path: Path) -> None:
+    frame = over_two(**{"formation.final_error_m": [9.0] * 8})  # metrics that are never a number have no column
+    assert not_settled(frame).all()
+    assert "most runs not settled" in drawn(frame, tmp_path)
+    summary(frame, ["topology.loss"], tmp_path / "one.svg")
+    assert "8 not settled by the end" in (tmp_path / "one.svg").read_text()
+
+
+def test_rounding_is_no_violation_and_one_value_has_no_scale(tmp_path: Path) -> None:
+    frame = over_two()
+    frame[MARGIN] = -1e-14
+    text = drawn(frame, tmp_path)
+    assert not [word for word in text if "e-14" in word or word == "-0"]
