@@ -378,7 +378,8 @@ def alone(folder: Path, case: str) -> Case:
     import libsumo
     import numpy as np
 
-    from trainctl.sumo.session import IDLE_S, PLANNED_M, silent
+    from trainctl.sumo.idling import IDLE_S, silent
+    from trainctl.sumo.session import PLANNED_M
 
     libsumo.start(json.loads((folder / "command.json").read_text(encoding="utf-8")))
     libsumo.simulationStep()

@@ -106,7 +106,9 @@ def compare(
         float | None, typer.Option(help="Share by which brakes scatter, either way; default 0.05.", rich_help_panel=SPACING)
     ] = None,
     runs_: Annotated[int | None, typer.Option("--runs", help="Runs of each cell; default 20.", rich_help_panel=SUITE)] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the suite in --out.", rich_help_panel=SUITE)] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with what is in --out; with spacing too.", rich_help_panel=SUITE)
+    ] = False,
     in_sumo: Annotated[
         bool, typer.Option("--in-sumo", help="Check the spacings that were found in SUMO as well.", rich_help_panel=SPACING)
     ] = False,
@@ -142,7 +144,7 @@ def compare(
         from trainctl.cli.spacing import spacing
 
         others = {
-            "runs": runs_, "resume": resume or None, "length-km": length_km, "signals-m": signals_m, "spacing-m": spacing_m,
+            "runs": runs_, "length-km": length_km, "signals-m": signals_m, "spacing-m": spacing_m,
             "spacings": spacings, "set": settings,
         }  # fmt: skip
         idle = [f"--{key}" for key, value in others.items() if value is not None] + ["--backend"] * (backend != "sumo")
@@ -150,7 +152,7 @@ def compare(
             raise InputError([f"{option}: not with `trainctl compare spacing`" for option in idle])
         asked = {**of_spacing, "trains": trains, "speed_mps": speed_mps}
         asked = {key: value for key, value in asked.items() if value is not None}
-        spacing(asked, rows_, out or Path("runs/spacing"), wanted, workers, as_json, in_sumo)
+        spacing(asked, rows_, out or Path("runs/spacing"), wanted, workers, as_json, in_sumo, resume)
         return
     if names == ["suite"] and controllers is None:
         from trainctl.cli.suite import suite
@@ -164,7 +166,8 @@ def compare(
         suite(runs_, spacing_m, rows_, out or Path("runs/suite"), workers, resume, as_json)
         return
     if runs_ is not None or resume:
-        raise InputError(f"--{'runs' if runs_ is not None else 'resume'}: only with `trainctl compare suite`")
+        option = "--runs: only" if runs_ is not None else "--resume: only with `trainctl compare spacing` or"
+        raise InputError(f"{option} with `trainctl compare suite`")
     given: dict[str, Any] = {key.replace("_", "-"): value for key, value in of_spacing.items()}
     given |= {"rows": rows_, "in-sumo": in_sumo or None}
     if idle := [f"--{key}: only with `trainctl compare spacing`" for key, value in given.items() if value is not None]:

@@ -12,7 +12,7 @@ from trainctl.errors import InputError
 
 def spacing(
     given: dict[str, Any], rows: str | None, out: Path, formats: tuple[str, ...], workers: int | None, as_json: bool,
-    sumo: bool,
+    sumo: bool, resume: bool,
 ) -> None:  # fmt: skip
     """Search, and show what was found.
 
@@ -22,7 +22,7 @@ def spacing(
         Numbers of the plan that are not its usual ones.
     rows : str, optional
         Rows of the table, separated by commas; default all.
-    out, formats, workers, as_json, sumo
+    out, formats, workers, as_json, sumo, resume
         As the command has them.
     """
     from trainctl.studies import spacing as study
@@ -34,7 +34,7 @@ def spacing(
         raise InputError([f"--rows {row}: no such row; there are: {', '.join(stops.ROWS)}" for row in strange])
     plan = stops.StopsPlan(**given)
     with Progress("spacing", sys.stderr.isatty()) as advance:
-        table = study.compare(plan, out, wanted, workers, sumo, advance)
+        table = study.compare(plan, out, wanted, workers, sumo, resume, advance)
     pictures = shown.figure(table, plan, out / "spacing", formats)
     lines, tex = stops.reference_lines(plan), out / "spacing.tex"
     tex.write_text(shown.latex(table, plan), encoding="utf-8")

@@ -130,7 +130,8 @@ def estimates(quantity: str, label: str) -> Callable[[Drawn], Figure]:
         if np.isfinite(both).any():
             spare = 0.1 * float(np.ptp(both[np.isfinite(both)])) + 1e-9
             axes[1].set_ylim(np.nanmin(both) - spare, np.nanmax(both) + spare)
-        axes[1].set_title("where that estimate is worst after the start", loc="right", fontsize=7)
+        axes[1].plot(time[rows], true[rows], ".", color=style.COLOURS[0], markersize=3, label="_rows")  # lines between are straight
+        axes[1].set_title("where that estimate is worst after the start; points are rows of the log", loc="right", fontsize=7)
         _bands(axes[2], drawn, guess - true, guess - true, guess - true)
         axes[2].set_ylabel("error [" + label.partition("[")[2])
         style.focus(axes[2], time, guess - true, guess - true)

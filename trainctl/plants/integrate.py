@@ -340,8 +340,10 @@ def described(*modules: Any) -> str:
     return " ".join([*(module.__name__ for module in modules), *(hashlib.sha256(s).hexdigest()[:16] for s in sources)])
 
 
-def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...]) -> Parts:
+def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...], exchanges: bool = True) -> Parts:
     """Make the functions of the closed loop ready for ``arguments``, those of ``advance`` after ``parts``.
+
+    Where nobody ``exchanges`` messages at instants, ``exchange`` is not made ready: that takes seconds.
 
     They serve as long as the types of the arguments stay: new values, links and constants of the same shape of data need no
     new call. Compiled code is cached on disk between processes.
@@ -354,7 +356,8 @@ def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...]) ->
     to_advance = (text, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes)
     to_exchange = (text, loop, first, links, references, air, t, own, estimate, work)
     place = hashlib.sha256(" ".join(m.__file__ for m in (law, observer, plant)).encode()).hexdigest()[:16]
-    return Parts(code, from_cache(advance_kernel, place, to_advance), from_cache(exchange_kernel, place, to_exchange))
+    exchange = from_cache(exchange_kernel, place, to_exchange) if exchanges else exchange_kernel
+    return Parts(code, from_cache(advance_kernel, place, to_advance), exchange)
 
 
 def from_cache(kernel: Any, place: str, arguments: tuple[Any, ...]) -> Callable[..., None]:

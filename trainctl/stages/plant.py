@@ -216,6 +216,7 @@ class Units:
             self.law, p.observer, p.plant,
             (loop, p.consists.first, p.consists.length, links, references, air, 0.0, self.h, 1, self.breaks, p.own, now.estimate,
              now.work, now.extremes),
+            exchanges=self.period is not None,
         )  # fmt: skip
         return now
 

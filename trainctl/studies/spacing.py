@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import multiprocessing
 import os
@@ -22,6 +23,9 @@ from trainctl.studies.stops import REFUSED, ROWS, SAFE, Outcome, StopsPlan, in_s
 
 if TYPE_CHECKING:
     pass
+
+#: What was found for a row, in its folder.
+ROW = "row.json"
 
 #: The found spacing is run with all stops at these shares of it.
 SHARES = (0.95, 1.0, 1.05, 1.10)
@@ -186,6 +190,7 @@ def compare(
     rows: Sequence[str] = ROWS,
     workers: int | None = None,
     sumo: bool = False,
+    resume: bool = False,
     progress: Callable[[int, int], Any] | None = None,
 ) -> list[dict[str, Any]]:
     """Find the smallest safe spacing of every row, each in a process of its own.
@@ -195,13 +200,15 @@ def compare(
     plan : StopsPlan
         What is asked.
     out : Path
-        Receives ``spacing.json`` and a folder per row with its scenarios.
+        Receives ``spacing.json`` and a folder per row with its scenarios and ``row.json``.
     rows : sequence of str
         Some of ``ROWS``.
     workers : int, optional
         Rows at a time; default one per processor.
     sumo : bool
         As in ``found``.
+    resume : bool
+        Rows in ``out`` that are done, and asked the same, stay.
     progress : callable, optional
         Called with (rows done, rows).
 
@@ -218,15 +225,29 @@ def compare(
     if mistakes := wrong(plan):
         raise InputError(mistakes)
     out.mkdir(parents=True, exist_ok=True)
-    done: dict[str, dict[str, Any]] = {}
+    todo = [row for row in rows if not (resume and _asked_the_same(plan, out / row))]
     if progress is not None:
-        progress(0, len(rows))
+        progress(len(rows) - len(todo), len(rows))
     with ProcessPoolExecutor(workers or os.cpu_count() or 1, multiprocessing.get_context("spawn")) as pool:
-        waiting = {pool.submit(found, plan, row, out / row, sumo): row for row in rows}
-        for k, future in enumerate(as_completed(waiting), 1):
-            done[waiting[future]] = future.result()
+        waiting = [pool.submit(_kept, plan, row, out / row, sumo) for row in todo]
+        for k, future in enumerate(as_completed(waiting), len(rows) - len(todo) + 1):
+            future.result()
             if progress is not None:
                 progress(k, len(rows))
-    table = [done[row] for row in rows]
+    table = [json.loads((out / row / ROW).read_text(encoding="utf-8"))["found"] for row in rows]
     write_json(out / "spacing.json", {"plan": plan._asdict(), "lines": reference_lines(plan), "rows": table})
     return table
+
+
+def _kept(plan: StopsPlan, row: str, out: Path, sumo: bool) -> None:
+    """Find a row and keep what was found."""
+    told = found(plan, row, out, sumo)
+    new = out / f"{ROW}.new"
+    write_json(new, {"plan": plan._asdict(), "found": told})
+    os.replace(new, out / ROW)
+
+
+def _asked_the_same(plan: StopsPlan, out: Path) -> bool:
+    """Whether a row that is done lies there."""
+    place = out / ROW
+    return place.is_file() and json.loads(place.read_text(encoding="utf-8"))["plan"] == json.loads(json.dumps(plan._asdict()))

@@ -279,6 +279,13 @@ def first_of(constants: Any) -> float:
 
 
 @compiles
+def test_an_exchange_that_nobody_makes_is_not_compiled() -> None:
+    rig = cruising()
+    spared = integrate.compiled(rig.part, none, coupled_units, rig._arguments(0.0, 0.01, 1), exchanges=False)
+    assert spared.exchange is integrate.exchange_kernel
+    assert rig.parts.exchange is not integrate.exchange_kernel
+
+
 def test_a_law_that_is_gone_costs_nobody_else_anything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Types are kept by name: an index that names a module which cannot be imported any more is lost as a whole."""
     monkeypatch.setattr(integrate.config, "CACHE_DIR", str(tmp_path))

@@ -166,6 +166,15 @@ def test_a_row_from_the_search_to_the_calm_run(tmp_path) -> None:
     json.dumps(row)
 
 
+def test_rows_that_are_done_stay(tmp_path) -> None:
+    place = tmp_path / "sliding_mode" / spacing.ROW
+    place.parent.mkdir()
+    place.write_text(json.dumps({"plan": PLAN._asdict(), "found": ROW}))
+    assert spacing.compare(PLAN, tmp_path, ("sliding_mode",), workers=1, resume=True) == [json.loads(json.dumps(ROW))]
+    assert json.loads((tmp_path / "spacing.json").read_text())["rows"][0]["spacing_m"] == 812.5
+    assert not spacing._asked_the_same(PLAN._replace(loss=0.5), place.parent)
+
+
 def test_a_plan_that_makes_no_sense_is_refused(tmp_path) -> None:
     with pytest.raises(InputError) as told:
         spacing.compare(StopsPlan(from_m=100.0, to_m=50.0, speed_mps=90.0), tmp_path)

@@ -78,5 +78,6 @@ def test_the_command(typed) -> None:
     assert status == 2 and said[0].startswith("--rows nobody: no such row; there are: ")
     assert typed("compare", "suite", "--stops", "3") == (2, ["--stops: not with `trainctl compare suite`"])
     assert typed("compare", "suite", "--runs", "0") == (2, ["--runs: must be at least 1"])
-    assert typed("compare", "spacing", "--resume") == (2, ["--resume: not with `trainctl compare spacing`"])
+    assert typed("compare", "spacing", "--runs", "3") == (2, ["--runs: not with `trainctl compare spacing`"])
+    assert typed("compare", "a", "--resume")[0] == 2
     assert typed("compare", "a", "--runs", "3") == (2, ["--runs: only with `trainctl compare suite`"])

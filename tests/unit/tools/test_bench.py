@@ -131,3 +131,14 @@ def test_reading_logs_is_measured_beside_the_bare_parser():
     assert list(rows) == ["regular", "few", "persons", "irregular", "strict", "one_line", "diff"]
     assert all(row["ratio_to_bare"] > 0.0 for name, row in rows.items() if name != "diff")
     assert rows["diff"]["mb"] == pytest.approx(2 * rows["regular"]["mb"], rel=0.1)
+
+
+def test_runs_side_by_side_are_as_many_train_steps_as_it_says(monkeypatch):
+    monkeypatch.syspath_prepend(str(FILE.parent))
+    ensembles = importlib.import_module("bench_ensembles")
+    monkeypatch.setattr(ensembles, "STEPS", 40)
+    found = ensembles.models(3, 0.2, True)
+    assert len({p.own.tobytes() for p in found}) == 3
+    assert ensembles.together(found) == ensembles.plain(3) == 3 * 6 * 40
+    rows = [{"case": "plain", "runs": 3, "million_per_s": 2.0, "us_per_train_step": 0.5, "to_plain": 1.0}, {"to_one": 1.8}]
+    assert ensembles.table(rows).splitlines()[-1] == "two processes at once do 1.8 times what one does"
