@@ -93,19 +93,19 @@ def test_trains_that_obey_pass_a_join_one_after_the_other_and_are_told_why_they_
     ids=["predecessor", "far", "insertionPredecessor", "insertionOrder", "foeInsertion", "trip", "single_track", "bidiPredecessor"],
 )  # fmt: skip
 def test_constraints_are_kept_as_in_plain_sumo(tmp_path, body, said):
-    make = join if "west0" in body else lambda folder, body: nets.single_track(folder, body, signals="1234")
-    times = {}
-    for name, additional in (("free", ""), ("bound", said)):
-        folder = tmp_path / name
-        folder.mkdir()
-        make(folder, body)
-        also(folder, additional)
-        found = ran(folder, 1500, signals="obey")
-        assert not amiss(found)
-        times[name] = at(found, "arrive") if "foeInsertion" not in said else at(found, "depart") | {"a": passed(found, "a", "main")}
-        theirs = {row["id"]: float(row["arrival"]) for row in plain(folder, "tripinfo")}
-        assert order_of(at(found, "arrive")) == order_of(theirs) and len(theirs) == 2
-    assert order_of(times["free"]) != order_of(times["bound"])
+    if "west0" in body:
+        join(tmp_path, body)
+    else:
+        nets.single_track(tmp_path, body, signals="1234")
+    free = {row["id"]: float(row["arrival"]) for row in plain(tmp_path, "tripinfo")}
+    also(tmp_path, said)
+    theirs = {row["id"]: float(row["arrival"]) for row in plain(tmp_path, "tripinfo")}
+    found = ran(tmp_path, 1150, signals="obey")
+    assert order_of(at(found, "arrive")) == order_of(theirs) and len(theirs) == 2 and not amiss(found)
+    if "foeInsertion" in said:  # it waits until the other one has come
+        assert theirs["a"] > free["a"] + 60.0 and passed(found, "a", "main") > at(found, "depart")["b"] > 199.0
+    else:
+        assert order_of(theirs) != order_of(free)
 
 
 def passed(found: Run, train: str, edge: str) -> float:
@@ -314,3 +314,17 @@ def test_what_is_chosen_is_said(tmp_path, signals, cooperate, obeys, said):
     p = open_scenario(str(tmp_path / "s.toml"))
     assert p.obeys is obeys
     assert any(said in note for note in p.roster.notes) if said else not any("signals" in note for note in p.roster.notes)
+
+
+@pytest.mark.parametrize(("driving", "turns"), [({"signals": "obey"}, 2), ({"others": "sumo", "cooperate": ["w"]}, 0)])
+def test_trains_turn_back_where_signals_are_obeyed_ours_and_those_of_sumo(tmp_path, driving, turns):
+    """A shuttle on a single track, and one that comes in from a branch."""
+    nodes = {"a": (0, 0), "b": (2000, 0), "c": (3500, 0), "d": (3250, 450)}
+    track = {**nets.both_ways("ab", "a", "b"), **nets.both_ways("bc", "b", "c"), **nets.both_ways("bd", "b", "d")}
+    nets.net(tmp_path, nodes, track, nets.TERMINALS, signals="b")
+    halts = "".join(f'<stop lane="{edge}_0" duration="20"/>' for edge in ("bc", "-ab"))
+    nets.traffic(tmp_path, nets.train("v", "ab bc -bc -ab ab bc", 0, halts) + nets.train("w", "-bd -ab", 200))
+    found = ran(tmp_path, 800, **driving)
+    assert set(at(found, "arrive")) == {"v", "w"} and not amiss(found) and found.ok
+    assert sum(e["kind"] == "turn" for e in found.events) == turns  # SUMO's turn without a word
+    assert sum(e["kind"] == "stop_left" for e in found.events) == 2 == len(found.stops.dropna(subset=["departure_s"]))

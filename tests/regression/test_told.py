@@ -148,7 +148,7 @@ def _blind(self, speed, acceleration, around, traffic, formed, commanded):
     return Driven(np.zeros(self.n), np.zeros(self.n, bool)), formed
 
 
-def _let_in(self, t, ways, here, speed, s, due, reach=None):
+def _let_in(self, t, ways, here, speed, s, due, reach=None, red=None, after=None):
     """Everybody comes at his time, whoever has the track."""
     nobody = np.zeros(len(speed), bool)
     s, held = self._request(t, ways, here, speed, nobody, nobody, s)

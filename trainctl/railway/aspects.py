@@ -16,7 +16,7 @@ from numba import njit
 from trainctl.kernels import keep_by_sources
 from trainctl.railway.along import Order
 from trainctl.railway.interlocking import Held
-from trainctl.railway.ways import Ways
+from trainctl.railway.ways import SAME_M, Ways
 from trainctl.signals import Bools, Floats, Ints
 
 keep_by_sources()  # before anything below is decorated
@@ -44,6 +44,7 @@ class State(NamedTuple):
     steps: Ints  # (Q,) for so many steps
     red: Ints  # (n,) signal before which each train had to stop, -1: none
     place: Floats  # (n,) m, where that is on its way
+    behind: Ints  # (n,) the edge behind it, -1: none
     cleared: Floats  # (n,) m, up to where each train might go
 
 
@@ -82,8 +83,9 @@ def table(ways: Ways, internal: Bools, signals: Mapping[tuple[int, int], int]) -
 def none(signals: int, trains: int) -> State:
     """Nothing seen yet."""
     return State(
-        np.full(signals, -1), np.zeros(signals, np.int64), np.full(trains, -1), np.full(trains, np.nan), np.full(trains, -np.inf)
-    )
+        first=np.full(signals, -1), steps=np.zeros(signals, np.int64), red=np.full(trains, -1), place=np.full(trains, np.nan),
+        behind=np.full(trains, -1), cleared=np.full(trains, -np.inf),
+    )  # fmt: skip
 
 
 def sighted(ways: Ways, at: Ints, row: Ints, s: Floats, present: Bools, horizon: Floats) -> Sighted:
@@ -137,9 +139,17 @@ def decide(
     red, place = np.where(present, red, -1), np.where(present, place, np.nan)
     cleared = np.where(present, np.where(red >= 0, place, np.inf), -np.inf)
     passed, lost = (before.red >= 0) & present & (s > before.place), (cleared < before.cleared) & (place - s < braking)
+    for i in np.flatnonzero(passed).tolist():  # unless it has turned, or has been led another way
+        passed[i] = _leads_past(ways, i, float(before.place[i]), int(before.behind[i]))
     told = [Told(i, int(before.red[i]), True, 0.0) for i in np.flatnonzero(passed).tolist()]
     told += [Told(i, int(red[i]), False, float(place[i] - s[i])) for i in np.flatnonzero(lost & ~passed).tolist()]
-    return State(first, steps, red, place, cleared), Held(room, zone, by), told
+    return State(first, steps, red, place, np.where(red >= 0, zone, -1), cleared), Held(room, zone, by), told
+
+
+def _leads_past(ways: Ways, i: int, place: float, edge: int) -> bool:
+    """Whether the way of a train enters this edge at this place [m]."""
+    rows = slice(ways.first[i], ways.first[i + 1])
+    return bool(np.any((ways.edge[rows] == edge) & (np.abs(ways.begin[rows] - place) < SAME_M)))
 
 
 def order(ways: Ways, joins: Bools, row: Ints, s: Floats, present: Bools, horizon: float, room: Floats) -> Order:

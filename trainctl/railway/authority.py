@@ -98,6 +98,18 @@ def _targets(body: Bodies, held: Floats, speed: Floats, present: Bools, at: int)
     )
 
 
+def stop_before(ways: Ways, row: Ints, s: Floats, edge: int, place: float, can: Floats) -> tuple[Ints, Floats]:
+    """Trains that come to a ``place`` [m] on an edge and ``can`` (n,) still stop in that way [m], and how far it is there [m].
+
+    Other arguments are those of ``look``.
+    """
+    rows = np.flatnonzero(ways.edge == edge)
+    train = np.searchsorted(ways.first, rows, side="right") - 1
+    room = ways.begin[rows] + place - s[train]
+    there = (rows >= row[train]) & (room > can[train])
+    return train[there], room[there]
+
+
 @njit(cache=True)
 def _limits(
     ways: Ways, limit: Floats, falls: Bools, factor: Floats, row: Ints, s: Floats, length: Floats, present: Bools, horizon: float

@@ -29,6 +29,9 @@ ENTERS_WITH = 0.8
 #: Farther than anything here [m].
 FAR_M = 1e9
 
+#: Who has been kept out by running trains for so long is let in by those that can still stop before its place [s].
+PATIENCE_S = 60.0
+
 #: Trains that must slow down, stop or wait within this time do not couple before [s].
 SOON_S = 60.0
 
@@ -225,7 +228,9 @@ class Traffic:
         if red is not None:
             s, held = s._replace(waits_for=red.by.copy()), red
         else:
-            s, held = self._request(t, ways, here, self._reach(speed) if reach is None else reach, asking, asking & ~stands, s)
+            before, reach = s.waits_for, self._reach(speed) if reach is None else reach
+            s, held = self._request(t, ways, here, reach, asking, asking & ~stands, s)
+            self._let_in(t, ways, here, speed, due, np.where(np.isin(before, due), 0.0, reach), held, s)
         s = s._replace(parked=s.parked.copy(), stands_until=s.stands_until.copy())
         present, came, entering = here.present.copy(), s.came.copy(), s.entering.copy()
         come: list[tuple[int, float]] = []
@@ -250,6 +255,20 @@ class Traffic:
         keeping = np.full(len(speed), -1)
         keeping[list(kept_out)] = list(kept_out.values())
         return s._replace(came=came, entering=entering, kept_out=keeping), held, tuple(come), kept_out
+
+    def _let_in(
+        self, t: float, ways: Ways, here: Seen, speed: Floats, due: Sequence[int], can: Floats, held: Held, s: State
+    ) -> None:
+        """Stop those that ``can`` (n,) [m] before the place of a train that running ones have kept out for long."""
+        for i in due:
+            edge, place = int(self.roster.edge[i]), float(self.roster.lane_position[i] - self.length[i]) - self.rules.margin_m
+            by = int(held.by[i] if held.room[i] <= 0.0 else s.kept_out[i])
+            passes = by < 0 or (speed[by] >= STANDS_MPS and here.edge[by] == edge)
+            if t - self.roster.depart[i] < PATIENCE_S or s.parked[i] or not passes:
+                continue
+            for j, room in zip(*authority.stop_before(ways, here.row, here.position, edge, place, can), strict=True):
+                if here.present[j] and room < held.room[j]:
+                    held.room[j], held.zone[j], held.by[j], s.waits_for[j] = room, edge, i, i
 
     def _entering_speed(
         self, i: int, ways: Ways, here: Seen, speed: Floats, view: View, held: Held, s: State, after: float
