@@ -36,7 +36,7 @@ class State(NamedTuple):
     k: int  # steps done
     own: Floats  # (U, 2 or 3) position [m], speed [m/s], force [N] of every unit
     orders: orders.State
-    rerouters: Ints  # (n,) edge on which a train found no way round what is closed, -1: none
+    rerouters: rerouters.State
     signals: signals.State
     traffic: traffic.State
     rule: Any  # of the formation rule: ``slots.State`` or ``convoys.State``

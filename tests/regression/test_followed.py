@@ -12,6 +12,7 @@ import pytest
 import tomli_w
 from beside import followed, plain
 
+from trainctl.errors import InputError
 from trainctl.metrics.traffic import metrics_of_fcd
 from trainctl.runner import resume, run
 from trainctl.runs.logs import vehicles
@@ -313,14 +314,59 @@ def metrics_of_stops(found: Run) -> dict[str, float]:
 
 
 def test_a_stop_on_a_closed_edge_is_dropped_and_what_else_a_rerouter_does_is_named(bypass):
-    (bypass / "s.add.xml").write_text(rerouter(f'{BC}<destProbReroute id="bc"/>'))
+    (bypass / "s.add.xml").write_text(rerouter(f'{BC}<closingLaneReroute id="bc_0"/>'))
     halts = '<stop lane="bc_0" endPos="1000" duration="20"/><stop lane="cd_0" endPos="1000" duration="20"/>'
     found = followed(bypass, nets.train("x", "ab bc cd", 0, halts), 600, ADDITIONAL)
     assert [e["stop"] for e in events(found, "stop_dropped")] == ["bc"]
     assert [e["stop"] for e in events(found, "stop_left")] == ["cd"]
-    assert "rerouter r: <destProbReroute>: not followed: trains keep their destinations" in [
-        e["what"] for e in events(found, "not_followed")
-    ]
+    assert "rerouter r: <closingLaneReroute>: not followed: no lane is closed" in [e["what"] for e in events(found, "not_followed")]
+
+
+#: What a rerouter lets trains draw from -> the edges of both trains' ways.
+DRAWN = {
+    "a destination": ('<destProbReroute id="fc"/>', ["ab bf fc"] * 2),
+    "a route": ('<routeProbReroute id="round"/><destProbReroute id="fc"/>', ["ab bf fc cd"] * 2),
+    "the one of weight": ('<destProbReroute id="fc" probability="0"/><destProbReroute id="ec" probability="2"/>', ["ab be ec"] * 2),
+    "its own": ('<destProbReroute id="keepDestination"/>', ["ab bc cd"] * 2),
+    "round what is closed": (f'{BC}<destProbReroute id="cd"/>', ["ab be ec cd"] * 2),
+}
+
+
+@pytest.mark.parametrize("case", DRAWN)
+def test_trains_draw_routes_and_destinations(bypass, case):
+    inside, ways = DRAWN[case]
+    route = '<additional><route id="round" edges="ab bf fc cd"/>'  # SUMO wants it before
+    (bypass / "s.add.xml").write_text(rerouter(inside).replace("<additional>", route))
+    body = nets.train("x", "ab bc cd", 0) + nets.train("y", "ab bc cd", 60)
+    found = followed(bypass, body, 900, ADDITIONAL)
+    trains = found.trains.astype({"train": str, "edge": str})
+    assert [" ".join(e for e in trains[trains.train == n].edge.unique() if e[0] != ":") for n in "xy"] == ways
+    assert len(events(found, "arrive")) == 2 and len(events(found, "reroute")) == 2 * (case != "its own")
+    plain(bypass, "vehroute", "--railsignal-moving-block", "--vehroute-output.last-route")
+    assert [row for row in re.findall(r'<route edges="([^"]*)"', (bypass / "plain.xml").read_text()) if row] == ways
+
+
+def test_what_trains_draw_goes_by_their_weights_and_their_names(bypass):
+    (bypass / "s.add.xml").write_text(
+        rerouter('<destProbReroute id="fc" probability="3"/><destProbReroute id="ec"/>', 'probability="0.9"')
+    )
+    body = nets.flow("f", "ab bc cd", 24, 40)
+    found = followed(bypass, body, 1000, ADDITIONAL, backends=("numeric",))
+    asked = [e["to_edge"] for e in events(found, "reroute")]
+    assert {"fc", "ec"} == set(asked) and len(asked) < 24 and asked.count("fc") > asked.count("ec")
+    said = [e["what"] for e in events(found, "not_followed")]
+    assert "rerouter r: <destProbReroute>: drawn here, with other numbers than SUMO's" in said
+
+
+def test_mistakes_in_what_trains_draw_from_are_told(bypass):
+    inside = '<destProbReroute id="nowhere"/><routeProbReroute id="none" probability="x"/>'
+    (bypass / "s.add.xml").write_text(rerouter(inside))
+    with pytest.raises(InputError) as refused:
+        followed(bypass, nets.train("x", "ab bc cd", 0), 100, ADDITIONAL)
+    words = "\n".join(refused.value.mistakes)
+    assert "rerouter r: destProbReroute nowhere: edge nowhere: not in the net" in words
+    assert "rerouter r: routeProbReroute none: no such route" in words
+    assert "rerouter r: routeProbReroute none: probability = x: must be a number, not negative" in words
 
 
 def test_who_cannot_leave_its_way_any_more_is_told(bypass):

@@ -78,7 +78,7 @@ class Model:
     @property
     def rerouted(self) -> bool:
         """Whether trains may be given other routes than they begin with."""
-        return any(event.kind == "reroute" for event in self.scenario.event) or bool(self.roster.closings)
+        return any(event.kind == "reroute" for event in self.scenario.event) or bool(self.roster.closings or self.roster.choices)
 
     @property
     def braked(self) -> bool:

@@ -19,6 +19,7 @@ from trainctl.scenario import mixed, passages
 from trainctl.scenario.tables import Scenario, TrafficTable, Train, TrainType
 from trainctl.scenario.train_types import fitted, train_type
 from trainctl.signals import Bools, Floats, Ints
+from trainctl.traffic.choices import Choice
 from trainctl.traffic.closings import Closing
 from trainctl.traffic.handed import Handed, handed, read_back
 from trainctl.traffic.known import of_signals
@@ -72,6 +73,7 @@ class Roster(NamedTuple):
     notes: tuple[str, ...]  # what of the configuration is not followed
     signs: tuple[tuple[float, str, float], ...]  # variable speed signs: from when on [s], edge, limit [m/s]
     closings: tuple[Closing, ...]  # edges closed for a time, round which trains are led
+    choices: tuple[Choice, ...]  # where trains draw another route or destination
     source: str  # the SUMO configuration; "" for [[train]] tables
     driven: Bools  # (n,) SUMO drives these itself
     signals: tuple[Signal, ...]  # rail signals of the net, where they are obeyed
@@ -107,8 +109,8 @@ def placed(scenario: Scenario, line: Line, rails: Rails | None = None) -> Roster
         arrival=np.full(n, np.inf), speed=np.array([t.speed_mps for t in scenario.train], float), like=("",) * n,
         top_speed=np.full(n, np.inf), speed_factor=np.ones(n),
         legs=tuple((line.route(t.track, t.position_m),) for t in scenario.train), stops=((),) * n, cooperates=np.ones(n, bool),
-        vclass=("rail",) * n, patience=np.inf, notes=(), signs=(), closings=(), source="", driven=np.zeros(n, bool), signals=(),
-        handed=None, placed=True, rails=Rails.of(line) if rails is None else rails,
+        vclass=("rail",) * n, patience=np.inf, notes=(), signs=(), closings=(), choices=(), source="", driven=np.zeros(n, bool),
+        signals=(), handed=None, placed=True, rails=Rails.of(line) if rails is None else rails,
     )  # fmt: skip
 
 
@@ -135,6 +137,10 @@ def from_tables(data: Mapping[str, Any], net: Path) -> Roster:
         patience=float(data["patience"]),
         notes=tuple(data["notes"]),
         signs=tuple((float(t), str(edge), float(v)) for t, edge, v in data["signs"]),
+        choices=tuple(
+            Choice(tuple(at), float(begin), float(end), float(share), tuple(types), tuple(map(tuple, ways)), tuple(weights))
+            for at, begin, end, share, types, ways, weights in data["choices"]
+        ),
         closings=tuple(
             Closing(tuple(at), str(closed), float(begin), float(end), float(share), tuple(types), tuple(classes))
             for at, closed, begin, end, share, types, classes in data["closings"]
@@ -279,6 +285,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
             *_slower(scenario, traffic, rails, whole),
         ),
         closings=tuple(c._replace(begin=c.begin - traffic.begin_s, end=c.end - traffic.begin_s) for c in traffic.closings),
+        choices=tuple(c._replace(begin=c.begin - traffic.begin_s, end=c.end - traffic.begin_s) for c in traffic.choices),
         source=str((folder / str(scenario.network.sumocfg)).resolve()),
         signs=tuple((t - traffic.begin_s, edge, v) for t, edge, v in traffic.signs),
         driven=driven,

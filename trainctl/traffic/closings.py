@@ -12,8 +12,6 @@ from trainctl.traffic.places import YES, Tracks
 #: What else a rerouter may hold: why it is not followed.
 OTHERS = {
     "closingLaneReroute": "no lane is closed",
-    "destProbReroute": "trains keep their destinations",
-    "routeProbReroute": "trains keep their routes",
     "parkingAreaReroute": "trains keep their parking areas",
     "stationReroute": "trains keep their stops",
     "viaProbReroute": "trains keep their routes",

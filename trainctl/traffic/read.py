@@ -18,6 +18,7 @@ from trainctl import draws
 from trainctl.errors import InputError
 from trainctl.traffic import crossings
 from trainctl.traffic.checks import not_followed, rail_trains, refuse
+from trainctl.traffic.choices import Choice, choices
 from trainctl.traffic.closings import Closing, closings
 from trainctl.traffic.duarouter import expand
 from trainctl.traffic.files import (
@@ -97,6 +98,7 @@ class Configuration(NamedTuple):
     notes: tuple[str, ...]  # what is not followed
     signs: tuple[Change, ...]  # variable speed signs
     closings: tuple[Closing, ...]
+    choices: tuple[Choice, ...]
     drawn: tuple[str, ...]  # flows whose departures are drawn
     signals: tuple[Signal, ...]  # rail signals of the net, by the tracks that they guard
     junctions: int  # so many of its junctions have some
@@ -164,8 +166,9 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         raise InputError([f"{sumocfg}: {line}" for line in refused])
     signs, wrong = speed_signs(elements.others, tracks)
     closed, rerouter_notes, mistakes = closings(elements.others, tracks, {k.vclass for k in kinds.values()})
-    more_notes += rerouter_notes
-    wrong += mistakes
+    drawn, drawn_notes, wrong_draws = choices(elements.others, elements.routes, tracks)
+    more_notes += [*rerouter_notes, *drawn_notes]
+    wrong += [*mistakes, *wrong_draws]
     if wrong:
         raise InputError([f"{sumocfg}: {line}" for line in wrong])
     refuse(sumocfg, net[0], trains, elements, kinds, tracks)
@@ -218,6 +221,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         notes=(*notes, *more_notes),
         signs=tuple(signs),
         closings=tuple(closed),
+        choices=tuple(drawn),
         drawn=tuple(t.get("id", "") for t in trains if "probability" in t.attrib or t.get("period", "").startswith("exp")),
         signals=rail_signals(tracks.file),
         junctions=sum(j.attributes.get("type") == "rail_signal" for j in tracks.file.junctions),
