@@ -150,6 +150,7 @@ def _blind(self, speed, acceleration, around, traffic, formed, commanded):
 
 def _let_in(self, t, ways, here, speed, s, due, reach=None, red=None, after=None):
     """Everybody comes at his time, whoever has the track."""
+    self._take_over(ways, s)
     nobody = np.zeros(len(speed), bool)
     s, held = self._request(t, ways, here, speed, nobody, nobody, s)
     come = tuple((i, 35.0) for i in due)
