@@ -265,8 +265,11 @@ def of_the_game(duration: float, **types: Any) -> dict[str, Any]:
 def test_rail_example_of_sumo(tmp_path):
     found = go(tmp_path, of_the_game(230.0, freightTrain=72.0, passengerTrain=52.0))
     count = kinds(found)
-    assert count["arrive"] == count["stop_reached"] == count["stop_left"] == 3
-    assert count["violation"] == count["supervisor"] == 0
+    assert count["depart"] == count["stop_reached"] == count["stop_left"] == 3
+    # Its rerouters are followed. They leave it to a player to set the signals: two trains are sent head on, stop and are told of.
+    assert count["reroute"] == 6 and count["violation"] == count["arrive"] == 0
+    (told,) = (e for e in found.events if e["kind"] == "gridlock")
+    assert told["trains"] == ["trip_0", "trip_1"] and found.info["checks_failed"] == ["gridlock"]
     assert "<collision " not in (found.folder / "sumo" / "collisions.xml").read_text()
     said = [e["message"] for e in found.events if e["kind"] == "sumo_warning"]
     assert all("Missing yellow phase" in message for message in said)  # its own signals', whoever drives
