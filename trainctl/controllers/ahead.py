@@ -14,10 +14,11 @@ to brake on.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from trainctl.controllers import stated
 from trainctl.signals import POSITION, SPEED, Bools, Bounds, Floats, Ints, Links, Reference, Scene, Trains, leader_at
 
 #: A reference slower than this does not tell the time [m/s].
@@ -146,3 +147,16 @@ def braking_violations(scene: Scene, brakes: Floats, key: str) -> Iterator[str]:
     """Trains whose braking nobody states."""
     for i in np.flatnonzero(~np.isfinite(brakes)).tolist():
         yield (f"{key}: missing; train {scene.trains[i]} has neither braking_n nor an input bound from which its braking follows")
+
+
+# In comparisons
+
+
+def alternative(tables: stated.Tables) -> dict[str, Any]:
+    """Tables that put this law in front of the traffic of another."""
+    return {"run": {**tables["run"], "control_period_s": stated.periods(tables["run"], 1.0)}}
+
+
+def on_a_line(tables: stated.Tables, band: dict[str, float]) -> dict[str, Any]:
+    """Tables of its row in `trainctl compare capacity`."""
+    return {**alternative(tables), "bounds": {"speed_upper_mps": band["speed_upper_mps"]}}

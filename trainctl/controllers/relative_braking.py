@@ -203,14 +203,7 @@ def report(params: Params, scene: Scene, disturbances: Sequence[Any]) -> list[st
 # In comparisons
 
 
-def alternative(tables: stated.Tables) -> dict[str, Any]:
-    """Tables that put this law in front of the traffic of another."""
-    return {"run": {**tables["run"], "control_period_s": stated.periods(tables["run"], 1.0)}}
-
-
-def on_a_line(tables: stated.Tables, band: dict[str, float]) -> dict[str, Any]:
-    """Tables of its row in `trainctl compare capacity`."""
-    return {**alternative(tables), "bounds": {"speed_upper_mps": band["speed_upper_mps"]}}
+alternative, on_a_line = ahead.alternative, ahead.on_a_line
 
 
 def in_stops(tables: stated.Tables, band: dict[str, float], braking: tuple[float, float]) -> dict[str, Any]:

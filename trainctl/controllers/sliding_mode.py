@@ -46,7 +46,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from trainctl.controllers import ahead, stated
+from trainctl.controllers import ahead
 from trainctl.signals import SPEED, Bounds, Demand, Floats, Links, Scene, Table, Trains
 
 if TYPE_CHECKING:
@@ -195,11 +195,4 @@ def violations(params: Params, scene: Scene) -> list[str]:
 # In comparisons
 
 
-def alternative(tables: stated.Tables) -> dict[str, Any]:
-    """Tables that put this law in front of the traffic of another."""
-    return {"run": {**tables["run"], "control_period_s": stated.periods(tables["run"], 1.0)}}
-
-
-def on_a_line(tables: stated.Tables, band: dict[str, float]) -> dict[str, Any]:
-    """Tables of its row in `trainctl compare capacity`."""
-    return {**alternative(tables), "bounds": {"speed_upper_mps": band["speed_upper_mps"]}}
+alternative, on_a_line = ahead.alternative, ahead.on_a_line

@@ -17,6 +17,7 @@ from trainctl.record.columns import Call
 from trainctl.scenario.model import Model
 from trainctl.scenario.roster import Stop
 from trainctl.signals import Bools, Floats, Ints, Seen
+from trainctl.stages.places import Room
 from trainctl.stages.record import Journal
 from trainctl.stages.turns import Turn, Turns, stopping
 
@@ -95,6 +96,7 @@ class Traffic:
         self.p, self.journal, self.roster = p, journal, p.roster
         self.rules, self.assumed = p.driver_rules, p.relied_on_by_driver
         self.step_s, self.theta = p.scenario.run.step_s, p.step_theta
+        self.room = Room(p)
         self.net, self.length = along.net(p.rails), p.consists.train_length()
         self.stops_of = np.array([len(stops) for stops in p.roster.stops], np.int64)
         self.looks, self.join_range_m = p.looks_ahead, p.driving.join_range_m if p.driven else 0.0
@@ -241,7 +243,7 @@ class Traffic:
             present[i] = True
             view = self._look(ways, here._replace(present=present), speed, held, s, self._reach(speed))
             if s.parked[i]:
-                present[i] = self._may_return(i, speed, view)
+                present[i] = self.room.returns(i, speed, view)
                 if present[i]:  # and stands for one more step, the one in which it comes back
                     s.parked[i], s.stands_until[i] = False, t + self.step_s
                 continue
@@ -306,39 +308,9 @@ class Traffic:
         other = int(view.ahead.train[i])
         if other >= 0 and roster.cooperates[[i, other]].all() and view.ahead.spacing[i] < self.p.spacing.desired - 1.0:
             return None
-        if view.fouling[i] or self._under(i, speed, view, after):
+        if view.fouling[i] or self.room.under(i, speed, view, after):
             return None
-        return None if self._startles(i, entry, speed, view) else entry
-
-    def _under(self, i: int, speed: Floats, view: View, after: float) -> bool:
-        """Whether another would be under train ``i`` or its tail by the time it comes, ``after`` so many seconds.
-
-        Until then it makes no way, whatever its speed, and whoever follows it may run on.
-        """
-        met = authority.of(view.clear, view.clear.other == i)
-        gains = self.theta * (self.p.supervision.greatest_mps2 + self.assumed.scatter) * after
-        way = (np.maximum(speed, 0.0) + gains + self.assumed.drift) * after
-        return bool(np.any(met.room < np.where(met.kind == supervisor.TRAIN, way[met.train] + self.rules.margin_m, 0.0)))
-
-    def _startles(self, i: int, entry: float, speed: Floats, view: View) -> bool:
-        """Whether others would have to brake hard for a train that comes with the speed ``entry``."""
-        trial = speed.copy()
-        trial[i] = entry
-        behind = view.targets.other == i
-        if not behind.any():
-            return False
-        asked, clear = authority.of(view.targets, behind), authority.of(view.clear, view.clear.other == i)
-        seen = authority.judge(
-            self.rules, trial, asked, clear, supervisor.no_limits(), self.step_s, self.theta, self.assumed, np.zeros(len(speed))
-        )
-        return bool(np.any(seen.emergency[view.targets.train[behind]]))
-
-    def _may_return(self, i: int, speed: Floats, view: View) -> bool:
-        """Whether a parked train finds its place on the track free; ``view`` has it there."""
-        ahead = authority.of(view.targets, (view.targets.train == i) & (view.targets.other >= 0))
-        if np.any(ahead.room < self.rules.margin_m) or view.fouling[i] or np.any(view.clear.room[view.clear.other == i] < 0.0):
-            return False
-        return not self._startles(i, 0.0, speed, view)
+        return None if self.room.startles(i, entry, speed, view) else entry
 
     # Stops
 
