@@ -149,6 +149,13 @@ def braking_violations(scene: Scene, brakes: Floats, key: str) -> Iterator[str]:
         yield (f"{key}: missing; train {scene.trains[i]} has neither braking_n nor an input bound from which its braking follows")
 
 
+def spectral_radius(scene: Scene, k_p: float, k_v: float) -> float:
+    """Of one train behind another that keeps its speed, over a control period; gains of spacing [1/s2] and speed [1/s]."""
+    T, theta = scene.control_period, scene.lead
+    loop = np.array([[1.0 - theta * T * T * k_p, T - theta * T * T * k_v], [-T * k_p, 1.0 - T * k_v]])
+    return float(np.abs(np.linalg.eigvals(loop)).max())
+
+
 # In comparisons
 
 

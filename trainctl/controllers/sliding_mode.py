@@ -177,9 +177,7 @@ def violations(params: Params, scene: Scene) -> list[str]:
         found.append(
             f"controller.observer_per_s = {omega:g}: omega T = {omega * T:g} with a control period of {T:g} s; must be below 1"
         )
-    k_v, k_p = c + reach, c * reach
-    loop = np.array([[1.0 - scene.lead * T * T * k_p, T - scene.lead * T * T * k_v], [-T * k_p, 1.0 - T * k_v]])
-    if (radius := float(np.abs(np.linalg.eigvals(loop)).max())) >= 1.0:
+    if (radius := ahead.spectral_radius(scene, c * reach, c + reach)) >= 1.0:
         found.append(
             f"controller.reach_mps2 = {params.reach_mps2:g}: unstable with surface_per_s = {c:g}, layer_mps ="
             f" {params.layer_mps:g} and a control period of {T:g} s (spectral radius {radius:.4f})"

@@ -204,10 +204,7 @@ def violations(params: Params, scene: Scene) -> list[str]:
 
 def _radius(params: Params, h: float, scene: Scene) -> float:
     """Spectral radius of one train behind another that keeps its speed, over a control period."""
-    T, k_p = scene.control_period, params.gain_per_s / h
-    k_v = (1.0 - params.acceleration_share) / h + params.gain_per_s
-    loop = np.array([[1.0 - scene.lead * T * T * k_p, T - scene.lead * T * T * k_v], [-T * k_p, 1.0 - T * k_v]])
-    return float(np.abs(np.linalg.eigvals(loop)).max())
+    return ahead.spectral_radius(scene, params.gain_per_s / h, (1.0 - params.acceleration_share) / h + params.gain_per_s)
 
 
 def minimum_gap(lag: float, acceleration_share: float) -> float:
