@@ -84,6 +84,9 @@ class Numeric:
     def halt(self, train: int, stands: bool) -> None:
         """Nobody sets signals here."""
 
+    def claim(self, claims: list[list[int]]) -> None:
+        """Nor here."""
+
     def linked(self, links: Links, formation: Ints) -> None:
         """Nobody looks."""
 
