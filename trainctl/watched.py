@@ -168,7 +168,7 @@ class Watched(Steps):
 
 
 def _nobody(trains: int) -> Links:
-    """Links of trains that hear nobody."""
+    """Links of trains that receive from none."""
     none, empty = np.zeros(0, np.int64), np.zeros(0)
     return Links(
         none, none, np.zeros(trains + 1, np.int64), empty, empty, empty, empty, np.zeros(0, bool), np.full(trains, np.nan),

@@ -239,7 +239,7 @@ class Orders:
         onward = rails.path(target, int(way[-1]))
         new = [*way[: k - 1].tolist(), *path.tolist(), *([] if onward is None else onward[1:].tolist())]
         if why := promise.uncovered(self.p, i, new):
-            raise Refused(f"the way to edge {event.to_edge} has {why}")
+            raise Refused(f"the path to edge {event.to_edge} has {why}")
         common = next((n for n, (a, b) in enumerate(zip(new, way.tolist(), strict=False)) if a != b), min(len(new), len(way)))
         more = {"to_edge": event.to_edge, "from_edge": rails.edges[int(way[max(common - 1, 0)])], "goes_on": onward is not None}
         return tuple(rails.edges[e] for e in new), more

@@ -119,7 +119,7 @@ class Rerouters:
                 new = onward if onward[:kept] == way[:kept] and not turns else None
             if new is None:
                 self.journal.event(
-                    t, "reroute_refused", train=train.id, reason=f"there is no way to edge {wanted[-1]} that it can still take",
+                    t, "reroute_refused", train=train.id, reason=f"there is no path to edge {wanted[-1]} that it can still take",
                     position_m=float(seen.position[i]),
                 )  # fmt: skip
                 return ()
