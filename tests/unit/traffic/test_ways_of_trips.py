@@ -44,7 +44,7 @@ def test_a_trip_turns_where_it_does_in_sumo(tmp_path, length, options):
         [theirs] = re.findall(r'<route edges="([^"]*)"', (tmp_path / "plain.xml").read_text())
     except subprocess.CalledProcessError as error:
         assert b"No connection between edge 'in' and edge 'out' found" in error.stderr
-        with pytest.raises(InputError, match="train v: no way from edge in to edge out"):
+        with pytest.raises(InputError, match="train v: no path from edge in to edge out"):
             read_traffic(sumocfg, tmp_path / "work")
         assert "penalty" in options or (length == 700 and "length" in options)
         return
