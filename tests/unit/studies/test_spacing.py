@@ -167,9 +167,9 @@ def test_a_row_from_the_search_to_the_calm_run(tmp_path) -> None:
 
 
 def test_the_string_gain_is_the_laws_own(tmp_path) -> None:
-    """Errors on every link would hide that a constant time gap damps them; with a constant spacing they grow."""
-    gap, constant = (spacing.measured(PLAN, row, 700.0, tmp_path)["string_gain"] for row in ("time_headway", "sliding_mode"))
-    assert 0.5 < gap < 1.0 < constant < 1.5
+    """A constant time gap damps what the train ahead does, relative braking passes it on; errors on every link would hide both."""
+    gap, relative = (spacing.measured(PLAN, row, 700.0, tmp_path)["string_gain"] for row in ("time_headway", "relative_braking"))
+    assert 0.5 < gap < 1.0 and relative == pytest.approx(1.0, abs=0.01)
 
 
 def test_sumo_says_the_same_of_stops_and_of_contacts(tmp_path, capfd) -> None:
