@@ -22,7 +22,6 @@ from trainctl.signals import Bools, Floats, Ints, Links, Start
 from trainctl.sumo.gui import Gui, Map
 from trainctl.topology import graph
 
-
 #: A train that is slower stands [m/s].
 STANDS_MPS = 1e-6
 
