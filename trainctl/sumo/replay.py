@@ -122,8 +122,8 @@ def _traffic(run: Run, scenario: Scenario, binary: str, from_s: float, delay_ms:
     ways = [_run_back(rails, [_way(rails, leg) for _, leg in own], float(n)) for own, n in zip(legs, lengths, strict=True)]
     turns = {(k, i): way for i, own in enumerate(legs) for (k, _), way in zip(own[1:], ways[i][1:], strict=True)}
     start = Start(
-        ids=ids, edge=np.array([own[0][0] for own in ways]), lane_position=places["m"].to_numpy(), speed=speed[first, range(len(ids))],
-        length=lengths,
+        ids=ids, edge=np.array([own[0][0] for own in ways]), lane_position=places["m"].to_numpy(),
+        speed=speed[first, range(len(ids))], length=lengths,
         unit_length=[consists.length[consists.first[k] : consists.first[k + 1]] for k in kept],
         routes=[tuple(rails.edges[e] for e in own[0]) for own in ways], present=first == 0, vclass=["rail"] * len(ids),
     )  # fmt: skip
