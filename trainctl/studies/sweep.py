@@ -413,7 +413,7 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
         with (
             LocalCluster(  # type: ignore[no-untyped-call]
                 n_workers=workers, threads_per_worker=1, processes=True, memory_limit=0, silence_logs=50,
-                host="127.0.0.1", dashboard_address="127.0.0.1:0",  # nobody else's business
+                host="127.0.0.1", dashboard_address="127.0.0.1:0",  # not to be reached from elsewhere
             ) as cluster,
             Client(cluster, set_as_default=False) as client,  # type: ignore[no-untyped-call]
         ):  # fmt: skip
