@@ -154,6 +154,8 @@ def _opened(
         write_info(partial, info)
         (partial / "scenario.toml").write_text(text, encoding="utf-8")
         keep_law(p, partial)
+        if backend == "numeric" and p.net is not None:
+            unpack(p.net, partial)  # where the trains were, for figures; SUMO keeps its own
         begin(partial, p, checkpoint_every_s, info)
         with _driven(p, partial, info, gui, checkpoint_every_s, None) as simulation:
             yield simulation

@@ -77,9 +77,11 @@ class Watched(Steps):
         """The state a step later."""
         world, now, t = self.world, self.world.measure(), self.time
         s = self._told(t, now, s)
-        stops_in = supervisor.stopping_distance(
-            np.maximum(now.speed, 0.0), self.rate, self.p.scenario.run.step_s, self.p.step_theta
-        )
+
+        def stops_in() -> Floats:
+            speed = np.maximum(now.speed, 0.0)
+            return supervisor.stopping_distance(speed, self.rate, self.p.scenario.run.step_s, self.p.step_theta)
+
         ordered, routes = self.orders.step(t, now.seen, world.ways, now.speed, stops_in, now.ahead, s.orders)
         for i, edges in routes:
             world.route(i, edges)
