@@ -24,8 +24,8 @@ from trainctl.signals import POSITION, SPEED, Bools, Bounds, Floats, Ints, Links
 #: A reference slower than this does not tell the time [m/s].
 STANDS_MPS = 0.1
 
-#: Speed feedback of a train that follows nobody, and of all below the maximum speed [1/s]: while it is slower than it wants, and
-#: faster, so that forces nobody knows of do not take it past the maximum; the second is less with long control periods.
+#: Speed feedback of a train that follows none, and of all below the maximum speed [1/s]: while it is slower than it wants, and
+#: faster, so that unknown forces do not take it past the maximum; the second is less with long control periods.
 CRUISE_PER_S, TOO_FAST_PER_S = 0.1, 0.5
 
 #: Share of the room between the speed of the reference and the maximum speed that closing up may use.
@@ -95,7 +95,7 @@ def seen(who: Followed, own: Trains, leader: Floats, links: Links, heard: Floats
 
 
 def cruising(own: Trains, leader: Floats, follows: Bools, faster: float, upper: Floats, period: float) -> Floats:
-    """Acceleration that takes a train to the reference's speed; one that follows somebody to at most ``faster`` above it.
+    """Acceleration that takes a train to the reference's speed; one that follows another to at most ``faster`` above it.
 
     A part of the room below the maximum speed ``upper`` (n,) [m/s] is left for what disturbs. ``period`` is the control period [s].
     """
@@ -146,7 +146,7 @@ def named(scene: Scene, who: Followed, i: int) -> str:
 
 
 def braking_violations(scene: Scene, brakes: Floats, key: str) -> Iterator[str]:
-    """Trains whose braking nobody states."""
+    """Trains whose braking is not stated."""
     for i in np.flatnonzero(~np.isfinite(brakes)).tolist():
         yield (f"{key}: missing; train {scene.trains[i]} has neither braking_n nor an input bound from which its braking follows")
 
