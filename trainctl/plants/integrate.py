@@ -35,7 +35,7 @@ LAW, OBSERVER, PLANT = range(3)
 #: Held while numba's settings are those of one law.
 COMPILING = threading.Lock()
 
-#: Trains integrated together where they do not hear each other: few enough for the second cache, enough to share the calls.
+#: Trains integrated together where they do not receive from each other: few enough for the second cache, enough to share the calls.
 TOGETHER = 64
 
 
@@ -243,13 +243,13 @@ def copy(out, table):  # type: ignore[no-untyped-def]
 
 @bare(inline="always")
 def talking(air):  # type: ignore[no-untyped-def]
-    """Whether trains hear each other within a stretch of integration."""
+    """Whether trains receive from each other within a stretch of integration."""
     return air.live and air.heard.shape[1] > 0
 
 
 @bare()
 def advance_kernel(code, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes):  # type: ignore[no-untyped-def]
-    """See ``advance``. Trains that do not hear each other meanwhile are taken a few at a time, so that they stay in the cache."""
+    """See ``advance``. Trains that receive nothing meanwhile are taken a few at a time, so that they stay in the cache."""
     trains = len(first) - 1
     size = trains if talking(air) else TOGETHER
     for low in range(0, trains, max(size, 1)):

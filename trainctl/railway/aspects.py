@@ -153,8 +153,13 @@ def _leads_past(ways: Ways, i: int, place: float, edge: int) -> bool:
 
 
 def order(ways: Ways, joins: Bools, row: Ints, s: Floats, present: Bools, horizon: float, room: Floats) -> Order:
-    """Turns at joins as signals give them: who has none before the join that stops it goes first, the nearest of these first."""
+    """Turns at joins as signals give them: who has none before the join that stops it goes first, the nearest of these first.
+
+    Of a train that passes a join more than once they are those of the first time.
+    """
     edge, train, away = _approaching(ways, joins, row, s, present, horizon, room)
+    first = np.unique(edge * len(row) + train, return_index=True)[1]  # each train's are there from near to far
+    edge, train, away = edge[first], train[first], away[first]
     by_edge = np.lexsort((train, away, edge))
     return Order(edge[by_edge], train[by_edge], np.arange(len(edge)))
 

@@ -24,6 +24,9 @@ from trainctl.stages.turns import Turn, Turns, stopping
 #: A train that is slower and nearer to its stop than this has reached it [m/s], [m].
 STANDS_MPS, STOP_BAND_M = 0.05, 2.0
 
+#: A train that passes a place just before it turns has done so this far before where it may turn last [m].
+PASSED_M = 0.5
+
 #: A train enters if it can do so with this share of its speed.
 ENTERS_WITH = 0.8
 
@@ -326,9 +329,12 @@ class Traffic:
         there = (self.stop_of(j, s) for j in np.flatnonzero(s.parked).tolist())
         return sum(other is not None and other.name == stop.name for other in there) >= stop.lots
 
-    def _place(self, stop: Stop, s: State) -> float:
-        """Where a train that stops has to stand now [m]."""
-        return stop.place - (stop.waits_before if self._full(stop, s) else 0.0)
+    def _place(self, stop: Stop, i: int, s: State) -> float:
+        """Where train ``i`` has to stand now for a stop, or to have passed [m]: no farther than it may to turn afterwards."""
+        last = self.turns.last_place(i)
+        if stop.passing:
+            return min(stop.place, last - PASSED_M)
+        return min(stop.place, last) - (stop.waits_before if self._full(stop, s) else 0.0)
 
     def _further(self, stop: Stop, i: int) -> float:
         """How far behind a stop a train would come to a stand that passes it as fast as it may [m]; 0 if it is to stand there."""
@@ -353,7 +359,7 @@ class Traffic:
             if stop is None:
                 s.stopping[i] = False
                 continue
-            room = self._place(stop, s) - float(seen.position[i])
+            room = self._place(stop, i, s) - float(seen.position[i])
             if standing[i]:
                 stays = t < s.stands_until[i] - 1e-9 or s.parked[i]
                 if speed[i] < STANDS_MPS if self.roster.driven[i] else stays:  # SUMO ends the stops of its own trains
@@ -366,25 +372,27 @@ class Traffic:
                 if stop is None:
                     s.stopping[i] = False
                     continue
-                room = self._place(stop, s) - float(seen.position[i])
+                room = self._place(stop, i, s) - float(seen.position[i])
             while stop is not None and stop.passing and room <= 0.0:
                 late = self._called(i, stop, t, t, int(seen.edge[i]), s)
                 self.journal.event(
                     t, "waypoint", train=self.p.scenario.ids[i], stop=stop.name, speed_mps=float(speed[i]), **_late(late)
                 )  # fmt: skip
                 stop = self.stop_of(i, s)
-                room = stop.place - float(seen.position[i]) if stop is not None else np.inf
+                room = self._place(stop, i, s) - float(seen.position[i]) if stop is not None else np.inf
             if stop is None:
                 s.stopping[i] = False
                 continue
             if not stop.passing and speed[i] < STANDS_MPS and room < STOP_BAND_M and not self._full(stop, s):
                 s.stands_since[i], s.stands_until[i] = t, max(t + stop.duration, stop.until)
                 more = _late(t - stop.planned) | ({"parked": True} if stop.parks else {})
-                self.journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=room, **more)
+                short = stop.place - float(seen.position[i])
+                self.journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=short, **more)
                 s.parked[i] = stop.parks
                 continue
+            beyond = self.turns.last_place(i) - float(seen.position[i]) - float(overrun[i])
             trains.append(i)
-            rooms.append(max(room - float(overrun[i]), 0.0) + self._further(stop, i))
+            rooms.append(min(max(room - float(overrun[i]), 0.0) + self._further(stop, i), max(beyond, 0.0)))
         if self.turns.yards:
             free = np.array([self.stop_of(i, s) is None for i in range(n)])
             stand, ahead = self.turns.wanted(seen, speed, free, ~np.isnan(s.turns_since), self.stopping, STANDS_MPS)

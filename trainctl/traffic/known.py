@@ -33,6 +33,7 @@ OFF = frozenset(("", "0", "false", "False", "off", "no", "-1", "none", "0.0", "0
 OPTIONS = _words(
     "net-file route-files additional-files begin end scale scale-suffix max-depart-delay use-stop-ended",
     "default.departspeed",
+    "railway.max-train-length weights.reversal-penalty weights.turnaround-penalty weights.minor-penalty weights.priority-factor",
     "railsignal-moving-block",  # where signals are obeyed, see of_signals
 )
 

@@ -20,7 +20,7 @@ from trainctl.traffic import crossings
 from trainctl.traffic.checks import not_followed, rail_trains, refuse
 from trainctl.traffic.choices import Choice, choices
 from trainctl.traffic.closings import Closing, closings
-from trainctl.traffic.duarouter import expand
+from trainctl.traffic.duarouter import ROUTING, expand
 from trainctl.traffic.files import (
     PLACES,
     Elements,
@@ -143,6 +143,12 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
     speed = options.get("default.departspeed", DEPART_SPEED)
     if speed not in _WORDS["departSpeed"] and bad_number(speed):
         wrong.append(f"{sumocfg}: default.departspeed = {speed}: must be a speed or one of {', '.join(_WORDS['departSpeed'])}")
+    routing = {key: options[key] for key in ROUTING if key in options}
+    for key, said in routing.items():
+        if not (is_number(said) if key == "weights.reversal-penalty" else not bad_number(said)):
+            wrong.append(
+                f"{sumocfg}: {key} = {said}: must be a number{'' if key == 'weights.reversal-penalty' else ', not negative'}"
+            )
     if wrong:
         raise InputError(wrong)
     begin, own_end = times["begin"], times["end"] if times["end"] >= 0 else None
@@ -177,14 +183,14 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         notes += scale_notes
     if in_doubt(net[0], tracks.file):
         tried(net[0])
-    expanded = expand(trains, elements, net[0], work, begin, min(ends) if ends else None, seed)
+    expanded = expand(trains, elements, net[0], work, begin, min(ends) if ends else None, seed, routing)
     order = {train.get("id", ""): k for k, train in enumerate(trains)}
     made = {vehicle.get("id", "") for vehicle in expanded}
     made |= {name.rpartition(".")[0] for name in made}
     departures = []
     handed: dict[str, tuple[Element, Element, tuple[str, ...]]] = {}
     wrong = [
-        f"{'flow' if t.tag == 'flow' else 'train'} {t.get('id')}: duarouter makes no route of it; are all its edges for its vClass?"
+        f"{'flow' if t.tag == 'flow' else 'train'} {t.get('id')}: duarouter finds no route; are all its edges open to its vClass?"
         for t in trains
         if t.get("id") not in made and _comes(t, begin, min(ends, default=math.inf))
     ]
@@ -207,7 +213,8 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
     used = {d.kind for _, d in departures}
     if plain := unmarked((e for _, d in departures for e in d.edges), tracks):
         notes.append(
-            f"net: {len(plain)} x edges of routes let everybody on, no rail class by name: tracks without their road traffic"
+            f"net: {len(plain)} x edges of routes are open to all classes, to no rail class by name: taken for tracks without"
+            " road traffic"
         )
     notes += crossings.told(tracks.file, [d.edges for _, d in departures])
     return Configuration(
@@ -302,7 +309,9 @@ def _departure(
     planned = [_planned(stop, late if k < of_lap else 0.0 if k >= laps * of_lap else None) for k, stop in enumerate(given)]
     wrong = [f"train {name}: {m}" for m in (*unconnected(list(edges), tracks), *off_route(edges, places, firsts))]
     wrong += [f"train {name}: {cut}"] if isinstance(cut, str) else []
-    wrong += [f"train {name}: {m}" for m in (_backwards(given, planned, places) if laps == 1 else [])]
+    # Where a stop is said to have ended, later than planned, what is planned of the next ones may lie before.
+    were_late = any(stop.get("ended") for one in (source, *routes_of(source, elements)) for stop in one.iter("stop"))
+    wrong += [f"train {name}: {m}" for m in (_backwards(given, planned, places) if laps == 1 and not were_late else [])]
     stops = [
         StopElement(
             edge=place.lane.rpartition("_")[0],
@@ -384,7 +393,7 @@ def _backwards(stops: list[Element], arrivals: list[float | None], places: list[
             if planned is not None and planned < last:
                 edge = place.lane.rpartition("_")[0]
                 wrong.append(
-                    f"stop on edge {edge}: {key} = {planned:g} s: must not be before {last:g} s, planned earlier on its way"
+                    f"stop on edge {edge}: {key} = {planned:g} s: must not be before {last:g} s, planned earlier on its route"
                 )
             last = max(last, planned or 0.0)
     return wrong

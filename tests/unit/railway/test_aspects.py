@@ -111,3 +111,13 @@ def test_turns_at_joins_are_those_of_the_signals(line):
     assert (found.edge.tolist(), found.train.tolist()) == ([2], [0])
     found = aspects.order(line.ways, joins, row, s, there, FAR, np.full(3, np.inf))
     assert found.train[np.argsort(found.rank)].tolist() == [2, 0, 1]
+
+
+def test_a_train_that_passes_a_join_again_has_its_turn_of_the_first_time():
+    """On a ring: the next time round comes after whoever is to join meanwhile."""
+    way, length = [[0, 2, 0, 2], [1, 2]], np.array([1000.0, 1000.0, 1000.0])
+    rows, joins = ways(way, np.zeros(3), length), np.array([True, False, True])
+    row, s = rows.first[:-1], np.array([900.0, 500.0])
+    found = aspects.order(rows, joins, row, s, np.ones(2, bool), FAR, np.full(2, np.inf))
+    turns = sorted(zip(found.rank.tolist(), found.edge.tolist(), found.train.tolist(), strict=True))
+    assert [(edge, train) for _, edge, train in turns] == [(0, 0), (2, 0), (2, 1)]
