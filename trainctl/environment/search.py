@@ -39,7 +39,7 @@ def returned(env: VectorTrains, gains: tuple[float, float], seed: int) -> float:
     seen, _ = env.reset(seed=seed)
     total, steps, truncated = 0.0, 0, False
     while not truncated:
-        seen, reward, _, ended, _ = env.step(linear(seen, env.agents.columns, gains)[:, None])
+        seen, reward, _, ended, _ = env.step(linear(seen.astype(np.float64), env.agents.columns, gains)[:, None])
         total, steps, truncated = total + float(reward.mean()), steps + 1, bool(ended.all())
     return total / steps
 
