@@ -33,7 +33,7 @@ class World(Protocol):
 
     @property
     def box(self) -> SignalBox | None:
-        """Who sets the signals; None: nobody obeys any."""
+        """What sets the signals; None: none are obeyed."""
 
     def start(self, start: Start) -> None:
         """Put the trains on the line; afterwards ``measure`` gives their initial positions."""
@@ -93,7 +93,7 @@ class SelfDriven(Protocol):
 
     @property
     def over(self) -> bool:
-        """Whether every train has left, and nobody is still to come."""
+        """Whether every train has left, and none is still to come."""
 
     def start(self) -> None:
         """Let the first trains in; afterwards ``measure`` gives the state at time 0."""

@@ -24,7 +24,7 @@ from trainctl.signals import POSITION, SPEED, Bools, Bounds, Floats, Ints, Links
 #: A reference slower than this does not tell the time [m/s].
 STANDS_MPS = 0.1
 
-#: Speed feedback of a train that follows nobody, and of all below the maximum speed [1/s].
+#: Speed feedback of a train that follows none, and of all below the maximum speed [1/s].
 CRUISE_PER_S = 0.1
 
 #: Share of the room between the speed of the reference and the maximum speed that closing up may use.
@@ -94,7 +94,7 @@ def seen(who: Followed, own: Trains, leader: Floats, links: Links, heard: Floats
 
 
 def cruising(own: Trains, leader: Floats, follows: Bools, faster: float, upper: Floats) -> Floats:
-    """Acceleration that takes a train to the reference's speed; one that follows somebody to at most ``faster`` above it.
+    """Acceleration that takes a train to the reference's speed; one that follows another to at most ``faster`` above it.
 
     A part of the room below the maximum speed ``upper`` (n,) [m/s] is left for what disturbs.
     """
@@ -144,7 +144,7 @@ def named(scene: Scene, who: Followed, i: int) -> str:
 
 
 def braking_violations(scene: Scene, brakes: Floats, key: str) -> Iterator[str]:
-    """Trains whose braking nobody states."""
+    """Trains whose braking is not stated."""
     for i in np.flatnonzero(~np.isfinite(brakes)).tolist():
         yield (f"{key}: missing; train {scene.trains[i]} has neither braking_n nor an input bound from which its braking follows")
 

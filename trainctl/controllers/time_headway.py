@@ -124,7 +124,7 @@ def constants(params: Params, scene: Scene) -> Constants:
 
 
 def _gaps(params: Params, scene: Scene, who: ahead.Followed) -> tuple[Floats, Floats]:
-    """Time gap [s] and spacing at standstill [m] of every train, (n,); 1 s and 0 m of those that follow nobody."""
+    """Time gap [s] and spacing at standstill [m] of every train, (n,); 1 s and 0 m of those that follow none."""
     top = ahead.fastest(scene.reference)
     d = np.where(who.follows, who.desired, top)
     if params.time_gap_s is not None:

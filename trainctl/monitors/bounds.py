@@ -98,7 +98,7 @@ class Alarms:
         """
         if self.watched:
             s.now[:] = np.stack(self.p.law.watched_bounds(self.p.params, scene))
-            if self.p.driven:  # a train in no formation is watched by nobody
+            if self.p.driven:  # a train in no formation is not watched
                 alone = np.bincount(scene.links.receiver, minlength=len(formation)) == 0
                 s.now[0, alone], s.now[1, alone] = -np.inf, np.inf
         piece = np.empty(len(formation), np.int64)

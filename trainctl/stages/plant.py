@@ -337,7 +337,7 @@ class Units:
         return more
 
     def overrun(self, own: Floats, braking: float) -> Floats:
-        """How much farther every train comes to a stand than by ``braking`` [m/s2] from now on, as actuators act late [m], (n,).
+        """How much farther every train runs to standstill than by ``braking`` [m/s2] from now on, as actuators act late [m], (n,).
 
         Until its brakes act a train gains the speed (a + b) / r on the plan, and loses it only by braking to the end.
         """

@@ -1,11 +1,11 @@
 """Emergency stops side by side: the question of ``studies.spacing``, and what comes of one spacing.
 
-How close trains may follow each other under a law: the smallest desired spacing at which nobody touches in any emergency stop.
+How close trains may follow each other under a law: the smallest desired spacing at which no trains touch in any emergency stop.
 
 The question is the same for all laws. Trains on a level line run at one speed, at their desired spacing but for small errors.
 Then the first one brakes as hard as it can, by an order of its own, to a stand; the reference of the others does not change, so
 they learn of it by messages alone. Messages come a period late, and some not at all, mostly in bursts. Brakes and running
-resistance are unlike from train to train, and no law is told by how much; a force nobody knows of acts on each, and measured
+resistance are unlike from train to train, and no law is told by how much; an unknown force acts on each, and measured
 positions are off (for continuous laws they are exact: such a law has no instants to measure at). Nothing protects the trains.
 
 A stop fails if two trains touch, or one is faster than the line. The **smallest safe spacing** is found by bisection with the
@@ -65,7 +65,7 @@ class StopsPlan(NamedTuple):
     seed: int = 1
     brake_scatter: float = 0.05  # brakes of a train, either way
     resistance_scatter: float = 0.2
-    input_mps2: float = 0.02  # force nobody knows of, uniform, anew every second
+    input_mps2: float = 0.02  # unknown force, uniform, drawn anew every second
     measured_m: float = 2.0  # error of measured positions, uniform
     position_error_m: float = 5.0  # at the start, uniform
     speed_error_mps: float = 0.2
@@ -193,13 +193,13 @@ class Unwatched(Record):
     """Of stops side by side nothing is recorded, and no alarm is raised: ``Watch`` looks."""
 
     def relinked(self, t: float, scene: Any, formed: Any, s: Any) -> None:
-        """Nobody is told."""
+        """Nothing is reported."""
 
     def tell(self, row: Any, ways: Any, here: Any, due: bool, s: Any) -> None:
-        """Nobody is told."""
+        """Nothing is reported."""
 
     def waits(self, t: float, here: Any, speed: Any, traffic: Any, around: Any, due: Any, s: Any) -> None:
-        """Nobody waits."""
+        """No train waits."""
 
 
 def unwatched(p: Model) -> Loop:

@@ -1,6 +1,6 @@
 """Every law in every situation: what happens to formations, in how many of some runs it goes wrong, with intervals, in one table.
 
-The trains are those of ``studies.stops``: brakes, resistance, errors of the start, forces nobody knows of and errors of
+The trains are those of ``studies.stops``: brakes, resistance, errors of the start, unknown forces and errors of
 measurement differ from run to run, messages are late and some get lost. In each situation one thing happens besides. The runs of
 a cell go side by side, each on a track of its own (with another one beside it where trains leave or join), in one closed loop
 without a simulator.
@@ -111,7 +111,7 @@ def _gradient(tables: Tables, line: Tables, runs: int) -> None:
 
 
 def _unit_lost(tables: Tables, line: Tables, runs: int) -> None:
-    """The first train brakes as in service; one in the middle lacks a quarter of its power and brakes, and nobody knows."""
+    """The first train brakes as in service; one in the middle lacks a quarter of its power and brakes, and no law knows."""
     _stop(tables, line, runs)
     for name, kind in tables["train_type"].items():
         if name.endswith(f".{MIDDLE}"):

@@ -28,7 +28,7 @@ from trainctl.sumo.preflight import objections
 from trainctl.sumo.signal_box import Box, Obeyed
 from trainctl.traffic.trial import tried_as_a_whole
 
-#: What SUMO adds in one step is exact to rounding; anything beyond was somebody else.
+#: What SUMO adds in one step is exact to rounding; anything beyond has another cause.
 TOLERANCE_M = 1e-6
 
 #: Closer than this to the end of its edge a train may be on the next one.
@@ -338,7 +338,7 @@ class Sumo(Session):
         self.turning.append((train, edges, arrival))
 
     def linked(self, links: Links, formation: Ints) -> None:
-        """Nobody looks."""
+        """Nothing is shown."""
 
     def move(self, displacement: Floats, step: float) -> None:
         """Command the mean speed of the step, displacement / T: SUMO's Euler update then moves the train by just that."""

@@ -1,7 +1,7 @@
 """SUMO as a signal box: rail signals that trains of ours obey, and trains of SUMO's own among them.
 
 Of whoever obeys SUMO's driver plans every step, so that it asks for signals, with the deceleration the train brakes with; what that
-driver wants is overruled all the same. SUMO lets nobody in before the block is free.
+driver wants is overruled all the same. SUMO lets no train in before the block is free.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Obeyed(NamedTuple):
 
 
 def obeyed(p: Model) -> Obeyed | None:
-    """The same of a scenario; None where nobody obeys signals."""
+    """The same of a scenario; None where signals are not obeyed."""
     handed = p.roster.handed
     if handed is None:
         return None
