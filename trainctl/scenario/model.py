@@ -147,6 +147,14 @@ class Model:
         """Rows of the head units in per-unit arrays, shape (n,)."""
         return self.consists.first[:-1]
 
+    def speeds(self, own: Floats) -> Floats:
+        """Speeds of the head units in ``own`` (U, s), contiguous, shape (n,) [m/s]."""
+        return np.ascontiguousarray(own[:, SPEED] if len(own) == len(self.consists.first) - 1 else own[self.leading, SPEED])
+
+    def fronts(self, own: Floats) -> Floats:
+        """Positions of the head units in ``own`` (U, s), shape (n,) [m]; not to be written into."""
+        return own[:, POSITION] if len(own) == len(self.consists.first) - 1 else own[self.leading, POSITION]
+
     @property
     def sampled(self) -> bool:
         """Whether the law is evaluated once per control period."""
