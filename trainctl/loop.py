@@ -111,6 +111,8 @@ class Loop(Steps):
 
         # signals: what they show -> how far every train may go before one, where they are obeyed
         shown, red = self.signals.step(t, ways, here, speed, s.traffic, world.box, s.signals)
+        if shown.aspects.claims != s.signals.aspects.claims:
+            world.claim(shown.aspects.claims)
 
         # traffic: departures, stops -> entries; whose turn it is; what is ahead of every train, where it is needed
         late = self.plant.overrun(own, p.driver_rules.service_mps2)
@@ -168,6 +170,8 @@ class Loop(Steps):
         for turn in around.turns:
             world.turn(*turn)
         world.move(moved.motion.displacement, p.scenario.run.step_s)
+        if world.box is not None and (kept := world.box.kept_parked()):
+            going = self.traffic.kept_parked(kept, going)
         formed = self.topology.rule.after(formed)
         if around.turns:
             moved, formed = self._turned(t, [turn.train for turn in around.turns], moved, formed, going, watch)

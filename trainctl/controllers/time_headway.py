@@ -170,7 +170,7 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
     spacing = np.where(other.known, other.spacing, 0.0)
     e = spacing - (c.r + c.h * own.speed)
     asked = c.k_a * other.acceleration + ((1.0 - c.k_a) * (other.speed - own.speed) + c.gain * e) / c.h
-    cruise = ahead.cruising(own, leader, c.who.follows, c.faster, c.bounds.speed_upper)
+    cruise = ahead.cruising(own, leader, c.who.follows, c.faster, c.bounds.speed_upper, c.period)
     given, limited = ahead.within(ahead.combined(asked, cruise, c.who.follows, other.known), c.brakes, c.pulls, c.bounds, own)
     return Demand(given, limited), State(own.speed.copy())
 

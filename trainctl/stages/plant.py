@@ -147,9 +147,8 @@ class Units:
         self.period = top.communication_period_s
         self.gradient = _slopes(p)
         self.moving = cast(UnitPlant, p.plant)
-        self.plant = self.moving.constants(
-            p.plant_params, p.consists, self.gradient, faults=p.scenario.fault, trains=p.scenario.ids
-        )
+        true = p.consists._replace(mass=p.consists.mass * p.scenario.mass_factor())  # all others go by what is stated
+        self.plant = self.moving.constants(p.plant_params, true, self.gradient, faults=p.scenario.fault, trains=p.scenario.ids)
         self.noise_hold = p.plant.noise_hold(p.plant_params)
         self.noisy = self.noise_hold is not None
         self.breaks = np.unique(
