@@ -240,6 +240,11 @@ def test_links_lead_somewhere(page):
             assert ((ROOT / page).parent / target).exists(), f"{page}: {target}"
 
 
+@pytest.mark.parametrize("page", PAGES)
+def test_no_page_has_what_a_merge_left(page):
+    assert not re.search(r"^(<{7}|={7}|>{7})", (ROOT / page).read_text(), re.M)
+
+
 def test_the_readme_fits_two_screens():
     """Of 60 lines each; a picture in it takes a third of one."""
     assert len((ROOT / "README.md").read_text().splitlines()) <= 120
