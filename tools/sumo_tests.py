@@ -41,7 +41,7 @@ from sumo_net.build import program
 from trainctl.errors import InputError
 from trainctl.scenario.starter import starter
 
-#: Nobody is waited for longer [s]: in the simulation, and for a run to end.
+#: No run is waited for longer [s]: in the simulation, and for a run to end.
 END_S, PATIENCE_S = 6000.0, 600.0
 
 

@@ -92,7 +92,7 @@ class Loop(Steps):
         # measure: SUMO -> where every train is on its way; its units follow, as a whole
         own = self._measured(s)
 
-        # orders: new routes first, since they change the rows of everybody
+        # orders: new routes first, since they change the rows of all trains
         def stops_in() -> Floats:
             acceleration = self.plant.acceleration(own)
             return supervisor.way_to_stop(
@@ -111,8 +111,10 @@ class Loop(Steps):
 
         # signals: what they show -> how far every train may go before one, where they are obeyed
         shown, red = self.signals.step(t, ways, here, speed, s.traffic, world.box, s.signals)
+        if shown.aspects.claims != s.signals.aspects.claims:
+            world.claim(shown.aspects.claims)
 
-        # traffic: departures, stops -> entries; whose turn it is; what is ahead of every train, where anybody asks
+        # traffic: departures, stops -> entries; whose turn it is; what is ahead of every train, where it is needed
         late = self.plant.overrun(own, p.driver_rules.service_mps2)
         going, around = self.traffic.step(t, ways, here, speed, late, s.traffic, red=red)
         for i, v in around.entries:
@@ -132,7 +134,7 @@ class Loop(Steps):
         if scene is not None:
             units = self._relinked(t, scene, formed, units, s.watch)
 
-        # control: -> what the law asks for; what a driver, or somebody outside, orders instead (NaN: the law leads)
+        # control: -> what the law asks for; what a driver, or a command from outside, orders instead (NaN: the law leads)
         acting = disturbance.at(self.disturbances, s.k, t, seen.position)
         demand, formed, messages, memory = self.control.step(
             s.k, t, own, self.plant.believed_resistance, formed, messages, s.demand, s.memory, s.commanded, acting
@@ -168,6 +170,8 @@ class Loop(Steps):
         for turn in around.turns:
             world.turn(*turn)
         world.move(moved.motion.displacement, p.scenario.run.step_s)
+        if world.box is not None and (kept := world.box.kept_parked()):
+            going = self.traffic.kept_parked(kept, going)
         formed = self.topology.rule.after(formed)
         if around.turns:
             moved, formed = self._turned(t, [turn.train for turn in around.turns], moved, formed, going, watch)
@@ -177,7 +181,7 @@ class Loop(Steps):
         )  # fmt: skip
 
     def end(self) -> None:
-        """The last instant, from which nobody moves on: no orders, no entries; else sorted, watched and recorded as any other."""
+        """The last instant, from which no train moves on: no orders, no entries; else sorted, watched and recorded as any other."""
         s, world, t = self.state, self.world, self.time
         own, here, ways = self._measured(s), world.measure(), world.ways
         late = self.plant.overrun(own, self.p.driver_rules.service_mps2)

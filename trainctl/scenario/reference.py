@@ -141,7 +141,7 @@ def obeying(
     below : float
         How far to stay below the limits (not the cap) [m/s].
     stop : float, optional
-        Where the reference comes to a stand [m]; it never does if left out.
+        Where the reference comes to a standstill [m]; it never does if left out.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""What the law asks for: messages exchanged and a sampled law evaluated; what somebody outside asks for instead."""
+"""What the law asks for: messages exchanged and a sampled law evaluated; what is commanded from outside instead."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A finished run shown again: SUMO moves the trains as they were recorded, nothing is computed anew."""
+"""A finished run replayed: SUMO moves the trains as they were recorded, nothing is computed anew."""
 
 from __future__ import annotations
 

@@ -242,7 +242,7 @@ def _departs(train: Element, begin: float) -> float:
 
 
 def _comes(train: Element, begin: float, end: float) -> bool:
-    """Whether a train, or one of a flow, must depart between these times; of a flow that is drawn nobody can tell."""
+    """Whether a train, or one of a flow, must depart between these times; of a flow that is drawn that is not known."""
     if train.tag != "flow":
         return begin <= _departs(train, begin) < end
     sure = train.get("number", "1") != "0" and "probability" not in train.attrib
