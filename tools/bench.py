@@ -452,7 +452,7 @@ def closed(folder: Path, case: str) -> Case:
     world: Any = open_world(model, folder, "sumo" if case in (*IN_SUMO, *SIGNALLED) else "numeric")
     loop = Loop(model, world, journal)
     loop.step()  # compiles or loads what the kernels need
-    clock.around(loop, "_measured", "read")
+    clock.around(loop, "measured", "read")
     clock.around(loop.topology, "step", "topology")
     clock.around(loop.control, "step", "control")
     clock.around(loop.plant, "step", "plant")

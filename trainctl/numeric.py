@@ -84,6 +84,9 @@ class Numeric:
     def halt(self, train: int, stands: bool) -> None:
         """No signals are set here."""
 
+    def claim(self, claims: list[list[int]]) -> None:
+        """Nor here."""
+
     def linked(self, links: Links, formation: Ints) -> None:
         """Nothing is shown."""
 

@@ -1,8 +1,8 @@
 """Who waits for whom: told when a wait grows long, and when trains wait for each other in a circle.
 
-A train waits if it stands, not at its own stop, or is due to enter and cannot. What it waits for is what forbids it to start: the
-train ahead, or whoever has the switch, or the block behind the signal, that it stands at. It needs all of these to go first; so
-trains of which each waits for another one of them never go again by themselves.
+A train waits if it stands, not at its own stop, or is due to enter, or to come back from where it is parked, and cannot. What it
+waits for is what forbids it to start: the train ahead, or whoever has the switch, or the block behind the signal it stands at. It
+needs all of these to go first; so trains of which each waits for another one of them never go again by themselves.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 STANDS_MPS = 0.05
 
 #: What is waited at; ``Wait.place`` is one of them.
-TRAIN, SWITCH, SIGNAL, ENTRY, TURN = "train", "switch", "signal", "entry", "turn"
+TRAIN, SWITCH, SIGNAL, ENTRY, TURN, PARKED = "train", "switch", "signal", "entry", "turn", "parked"
 
 
 class Wait(NamedTuple):

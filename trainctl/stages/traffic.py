@@ -199,6 +199,12 @@ class Traffic:
             )  # fmt: skip
         return s._replace(came=(s.came | there) & ~(s.entering & ~there), entering=np.zeros_like(s.entering))
 
+    def kept_parked(self, trains: Sequence[int], s: State) -> State:
+        """Trains that SUMO has not let back from where they are parked: they are to ask again."""
+        s = s._replace(parked=s.parked.copy())
+        s.parked[trains] = True
+        return s
+
     def due(self, t: float, s: State) -> list[int]:
         """Trains that are to come at ``t``: of each edge the first that waits there."""
         if s.came.all():
@@ -236,7 +242,7 @@ class Traffic:
             before, reach = s.waits_for, self._reach(speed) if reach is None else reach
             s, held = self._request(t, ways, here, reach, asking, asking & ~stands, s)
             self._let_in(t, ways, here, speed, due, np.where(np.isin(before, due), 0.0, reach), held, s)
-        s = s._replace(parked=s.parked.copy(), stands_until=s.stands_until.copy())
+        s = s._replace(parked=s.parked.copy())
         present, came, entering = here.present.copy(), s.came.copy(), s.entering.copy()
         come: list[tuple[int, float]] = []
         kept_out: dict[int, int] = {}
@@ -247,8 +253,7 @@ class Traffic:
             view = self._look(ways, here._replace(present=present), speed, held, s, self._reach(speed))
             if s.parked[i]:
                 present[i] = self.room.returns(i, speed, view)
-                if present[i]:  # and stands for one more step, the one in which it comes back
-                    s.parked[i], s.stands_until[i] = False, t + self.step_s
+                s.parked[i] = not present[i]  # and stands for one more step, the one in which it comes back
                 continue
             v = self._entering_speed(i, ways, here, speed, view, held, s, after)
             present[i] = v is not None

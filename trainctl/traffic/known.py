@@ -158,7 +158,7 @@ NAMED: Mapping[tuple[str, str], tuple[str, frozenset[str]] | Refused] = {
     ("stop", "index"): ("stops are made in the order of the file", _words("end fit")),
     ("stop", "extension"): ("the train does not wait for others", OFF),
     ("parkingArea", "roadsideCapacity"): ("trains park at its end, whichever place is free", _words("0 1")),
-    ("parkingArea", "onRoad"): ("who stops there leaves the track", OFF),
+    ("parkingArea", "onRoad"): ("a train that stops there leaves the track", OFF),
     ("vType", "scale"): ("every train of it comes once", _words("1 1.0 1.00")),
     **{
         ("vType", key): ("train type and law of the scenario drive the train", frozenset[str]())
