@@ -60,11 +60,13 @@ class Loop(Steps):
         SUMO, or the numeric stand-in.
     journal : Journal
         Where rows and events go.
+    goes_on : bool
+        Whether the trains are on the railway already.
     """
 
     state: State
 
-    def __init__(self, model: Model, world: World, journal: record.Journal) -> None:
+    def __init__(self, model: Model, world: World, journal: record.Journal, goes_on: bool = False) -> None:
         super().__init__(model, journal)
         self.world, self.built = world, model
         p, run = model, model.scenario.run
@@ -83,7 +85,8 @@ class Loop(Steps):
             messages=exchange.silent(), demand=self.control.initial(), memory=(),
             commanded=np.full(len(p.scenario.ids), np.nan), plant=self.plant.initial(), watch=self.record.initial(),
         )  # fmt: skip
-        self._start()
+        if not goes_on:
+            self._start()
 
     def after(self, s: State) -> State:
         """The state a step later."""

@@ -59,6 +59,7 @@ if TYPE_CHECKING:
 CLOCK: Literal["continuous"] = "continuous"
 ORDER: Literal["parallel", "chain"] = "chain"
 MESSAGE = 4
+WORK: tuple[str, ...] = ()
 WATCHED = ("spacing_error_m", "speed_error_mps", "q_error_mps")
 
 #: A train is linked only once (39) holds: the barrier has no value outside.

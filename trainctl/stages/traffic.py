@@ -12,17 +12,16 @@ from trainctl.monitors import waiting
 from trainctl.railway import along, aspects, authority, interlocking, signs, supervisor, zones
 from trainctl.railway.authority import DRIVER_MARGIN_M, View
 from trainctl.railway.interlocking import Held
-from trainctl.railway.ways import Ways, moved
+from trainctl.railway.ways import Ways, moved, unchanged
 from trainctl.record.columns import Call
 from trainctl.scenario.model import Model
 from trainctl.scenario.roster import Stop
 from trainctl.signals import Bools, Floats, Ints, Seen
-from trainctl.stages.places import Room
+from trainctl.stages import calls
+from trainctl.stages.calls import STANDS_MPS, STOP_BAND_M
+from trainctl.stages.places import Room, meets
 from trainctl.stages.record import Journal
 from trainctl.stages.turns import Turn, Turns, stopping
-
-#: A train that is slower and nearer to its stop than this has reached it [m/s], [m].
-STANDS_MPS, STOP_BAND_M = 0.05, 2.0
 
 #: A train enters if it can do so with this share of its speed.
 ENTERS_WITH = 0.8
@@ -98,7 +97,6 @@ class Traffic:
         self.step_s, self.theta = p.scenario.run.step_s, p.step_theta
         self.room = Room(p)
         self.net, self.length = along.net(p.rails), p.consists.train_length()
-        self.stops_of = np.array([len(stops) for stops in p.roster.stops], np.int64)
         self.looks, self.join_range_m = p.looks_ahead, p.driving.join_range_m if p.driven else 0.0
         planned = min(
             p.supervision.emergency_mps2, p.supervision.service_mps2, *([p.driving.deceleration_mps2] if p.driven else [])
@@ -113,6 +111,7 @@ class Traffic:
         self.ways: Ways | None = None
         self._limits(0.0)
         self.turns, self.stopping, self.stops = Turns(p, self.net, journal), stopping(p), list(p.roster.stops)
+        self.calls = calls.calls(self.stops)
 
     def initial(self) -> State:
         """Before the run: trains that are placed have come."""
@@ -166,12 +165,15 @@ class Traffic:
         self.ways, self.zones = ways, zones.of(ways, self.net, self.turns.later)
         if self.turns.any:
             self.turns.changed(ways, s.leg)
-        if self.stops_of.any():
+        if self.calls.number.any():
             begun = self.turns.begun(s.leg)
-            self.stops = [
-                tuple(one._replace(place=moved(begun, ways, i, one.place)) if one.leg == s.leg[i] else one for one in stops)
-                for i, stops in enumerate(self.roster.stops)
-            ]
+            self.stops = list(self.roster.stops)
+            for i in np.flatnonzero(~unchanged(begun, ways)).tolist():
+                self.stops[i] = tuple(
+                    one._replace(place=moved(begun, ways, i, one.place)) if one.leg == s.leg[i] else one
+                    for one in self.roster.stops[i]
+                )
+            self.calls = calls.calls(self.stops)
 
     # Arrivals and entries
 
@@ -234,25 +236,32 @@ class Traffic:
             s, held = self._request(t, ways, here, reach, asking, asking & ~stands, s)
             self._let_in(t, ways, here, speed, due, np.where(np.isin(before, due), 0.0, reach), held, s)
         s = s._replace(parked=s.parked.copy(), stands_until=s.stands_until.copy())
-        present, came, entering = here.present.copy(), s.came.copy(), s.entering.copy()
+        present, came, entering, reach = here.present.copy(), s.came.copy(), s.entering.copy(), self._reach(speed)
         come: list[tuple[int, float]] = []
         kept_out: dict[int, int] = {}
+        asking[[i for i in due if held.room[i] <= 0.0]] = False
+        together: View | None = None  # with all who ask at their places
         for i in due:
             if held.room[i] <= 0.0:
                 continue
-            present[i] = True
-            view = self._look(ways, here._replace(present=present), speed, held, s, self._reach(speed))
+            if together is None:
+                guests = asking.copy()
+                together = self._look(ways, here._replace(present=present | guests), speed, held, s, reach)
+            present[i], asking[i], view = True, False, together
+            if meets(together, i, guests):  # to each of them only those are there that have come
+                view = self._look(ways, here._replace(present=present), speed, held, s, reach)
             if s.parked[i]:
                 present[i] = self.room.returns(i, speed, view)
                 if present[i]:  # and stands for one more step, the one in which it comes back
-                    s.parked[i], s.stands_until[i] = False, t + self.step_s
+                    s.parked[i], s.stands_until[i], together = False, t + self.step_s, None
                 continue
             v = self._entering_speed(i, ways, here, speed, view, held, s, after)
             present[i] = v is not None
             if v is None:
                 kept_out[i] = waiting.kept_out(view, i)
                 continue
-            came[i], entering[i], speed[i] = True, True, v
+            came[i], entering[i], speed[i], together = True, True, v, None
+            reach = self._reach(speed)
             come.append((i, v))
         keeping = np.full(len(speed), -1)
         keeping[list(kept_out)] = list(kept_out.values())
@@ -332,19 +341,21 @@ class Traffic:
 
     def _further(self, stop: Stop, i: int) -> float:
         """How far behind a stop a train would come to a stand that passes it as fast as it may [m]; 0 if it is to stand there."""
-        return float(self.stopping(np.array([i]), np.array([stop.passing]))[0])
+        return float(self.stopping(np.array([i]), np.array([stop.passing]))[0]) if stop.passing else 0.0
 
     def _stops(self, t: float, seen: Seen, speed: Floats, overrun: Floats, s: State) -> tuple[State, tuple[Ints, Floats], Bools]:
         """Arrive at and leave stops; the trains that have one ahead and the room to it [m], and who stops soon."""
         trains, rooms, n = [], [], len(speed)
-        if not (self.stops_of.any() or self.turns.any):
+        if not (self.calls.number.any() or self.turns.any):
             return s, nothing(n).stops, np.zeros(n, bool)
         standing = ~np.isnan(s.stands_until)
         s = s._replace(
             next_stop=s.next_stop.copy(), stands_since=s.stands_since.copy(), stands_until=s.stands_until.copy(),
             late=s.late.copy(), stopping=s.stopping.copy(), parked=s.parked.copy(),
         )  # fmt: skip
-        for i in np.flatnonzero(seen.present & (s.next_stop < self.stops_of)).tolist():
+        asked = np.flatnonzero(seen.present & (s.next_stop < self.calls.number))
+        plain, ahead = calls.on_the_way(self.calls, asked, s.next_stop, s.leg, seen.position, speed, standing)
+        for i in asked[~plain].tolist():
             stop = self.stop_of(i, s)
             while stop is not None and np.isnan(stop.place):
                 self.journal.event(t, "stop_dropped", train=self.p.scenario.ids[i], stop=stop.name)
@@ -385,13 +396,17 @@ class Traffic:
                 continue
             trains.append(i)
             rooms.append(max(room - float(overrun[i]), 0.0) + self._further(stop, i))
+        trains += asked[plain].tolist()
+        rooms += np.maximum(ahead[plain] - overrun[asked[plain]], 0.0).tolist()
+        by_train = sorted(range(len(trains)), key=trains.__getitem__)
+        trains, rooms = [trains[k] for k in by_train], [rooms[k] for k in by_train]
         if self.turns.yards:
             free = np.array([self.stop_of(i, s) is None for i in range(n)])
-            stand, ahead = self.turns.wanted(seen, speed, free, ~np.isnan(s.turns_since), self.stopping, STANDS_MPS)
+            stand, further = self.turns.wanted(seen, speed, free, ~np.isnan(s.turns_since), self.stopping, STANDS_MPS)
             s = s._replace(turns_since=s.turns_since.copy())
             s.turns_since[[i for i in stand if np.isnan(s.turns_since[i])]] = t
-            trains += [i for i, _ in ahead]
-            rooms += [max(room - float(overrun[i]), 0.0) for i, room in ahead]
+            trains += [i for i, _ in further]
+            rooms += [max(room - float(overrun[i]), 0.0) for i, room in further]
         found, room_to = np.array(trains, np.int64), np.array(rooms)
         braking = self.stopping(found, speed[found])
         near, soon = np.zeros(n, bool), np.zeros(n, bool)
@@ -432,14 +447,6 @@ class Traffic:
         braking = supervisor.stopping_distance(v, self.requesting, self.step_s, self.theta)
         return braking + 4.0 * v * self.step_s + rules.margin_m + 2.0 * DRIVER_MARGIN_M + 50.0 + 6.0 * assumed.uncertainty
 
-    def _own_stops(self, s: State) -> Floats:
-        """Where every train is to stand next [m], shape (n,); inf: nowhere."""
-        places = np.full(len(self.length), np.inf)
-        for i in np.flatnonzero(s.came & ~s.left & (s.next_stop < self.stops_of)).tolist():
-            stop = self.stop_of(i, s)
-            places[i] = np.inf if stop is None or stop.passing else stop.place
-        return places
-
     def _ordered(self, t: float, ways: Ways, seen: Seen, s: State) -> list[tuple[int, int, int]]:
         """Trains that must let another one pass an edge first: train, row of the edge in its way, the other one."""
         found = []
@@ -458,9 +465,10 @@ class Traffic:
         self, t: float, ways: Ways, seen: Seen, reach: Floats, entering: Bools, keeps: Bools, s: State
     ) -> tuple[State, Held]:
         """Let every train request what lies within its reach; ``entering`` (n,) are those that ask to enter the net."""
+        stops = calls.own_stops(self.calls, s.came & ~s.left, s.next_stop, s.leg)
         requests, held, said = interlocking.request(
             self.zones, s.requests, seen.row, seen.position, self.length, seen.present, reach,
-            self.p.supervision.margin_m + DRIVER_MARGIN_M, entering, self._own_stops(s), s.standing,
+            self.p.supervision.margin_m + DRIVER_MARGIN_M, entering, stops, s.standing,
             self._ordered(t, ways, seen, s), keeps, self.turns.back(s.leg),
         )  # fmt: skip
         ids, edges = self.p.scenario.ids, self.p.rails.edges

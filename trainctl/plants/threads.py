@@ -1,0 +1,64 @@
+"""Trains shared out to threads: whole formations, each with work space of its own, so no number depends on how many there are.
+
+Compiled code releases Python's lock while it integrates, so plain threads of Python use all cores.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+
+from trainctl.signals import Ints, Links
+
+#: Environment variable with the number of threads; all cores if it is not set.
+THREADS = "TRAINCTL_THREADS"
+
+#: A thread takes at least so many trains: for fewer it is not worth the 50 us of a call.
+LEAST = 64
+
+
+class Shares(NamedTuple):
+    """Which thread integrates which trains."""
+
+    ranges: tuple[tuple[int, int], ...]  # first train and the one behind the last
+    order: Ints  # (n,) as ``Links.order``, share by share
+    space: tuple[str, ...] = ()  # fields of the law's constants of which each thread needs its own
+    pool: ThreadPoolExecutor | None = None  # of all threads but the calling one
+
+
+def cores() -> int:
+    """How many threads there may be: as the environment says, or as many as the process has cores."""
+    given = os.environ.get(THREADS, "")
+    return max(int(given), 1) if given.isdigit() else len(os.sched_getaffinity(0))
+
+
+def shares(first: Ints, links: Links, talk: bool, threads: int) -> Shares:
+    """Cut trains into ranges of about as many units each, between trains that do not hear each other.
+
+    Parameters
+    ----------
+    first : ndarray, shape (n + 1,)
+        Units of train ``i``: ``first[i]:first[i + 1]``.
+    links : Links
+        Who hears whom.
+    talk : bool
+        Whether they do within a stretch of integration; else trains may be cut anywhere.
+    threads : int
+        At most so many ranges.
+    """
+    n = len(first) - 1
+    crossed = np.zeros(n + 2, np.int64)  # links over the cut before each train
+    if talk:
+        np.add.at(crossed, np.minimum(links.sender, links.receiver) + 1, 1)
+        np.add.at(crossed, np.maximum(links.sender, links.receiver) + 1, -1)
+    cuts = np.flatnonzero(np.cumsum(crossed)[: n + 1] == 0)
+    number = max(min(threads, n // LEAST), 1)
+    wanted = first[-1] * np.arange(1, number) / number
+    nearest = np.abs(first[cuts][None, :] - wanted[:, None]).argmin(axis=1)
+    bounds = np.unique([0, *cuts[nearest].tolist(), n])
+    share = np.searchsorted(bounds, links.order, side="right")
+    ranges = tuple(zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True))
+    return Shares(ranges, links.order[np.argsort(share, kind="stable")])
