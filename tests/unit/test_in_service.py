@@ -108,8 +108,9 @@ def test_rosters_that_name_trains_or_are_short_are_not_divided(tmp_path):
     assert in_service.divisible(p)
     assert not in_service.divisible(open_scenario("three_tracks"))
     text = (tmp_path / "in" / "scenario.toml").read_text()
-    two = [name for name in p.scenario.ids if name.startswith("local.0.")][:2]
-    named = f'[[order]]\nedge = "E0.0"\ntrains = {json.dumps(two)}\n'
+    alike = [i for i, legs in enumerate(p.roster.legs) if legs == p.roster.legs[-1]][:2]
+    two, edge = [p.scenario.ids[i] for i in alike], p.roster.legs[-1][0][0]
+    named = f'[[order]]\nedge = "{edge}"\ntrains = {json.dumps(two)}\n'
     (tmp_path / "in" / "scenario.toml").write_text(text + named)
     assert not in_service.divisible(open_scenario(str(tmp_path / "in" / "scenario.toml")))
 

@@ -23,7 +23,7 @@ from numba.extending import overload
 from trainctl.errors import LawError
 from trainctl.kernels import bare
 from trainctl.plants import shared
-from trainctl.plants.threads import Shares
+from trainctl.plants.threads import ALONE, Shares
 from trainctl.plants.views import CORRECTION, ESTIMATE, OWN, UNITS, block, numbers
 from trainctl.signals import FORCE, POSITION, POWERS, SPEED, Bools, Extremes, Floats, Ints, Links, References, evaluate
 
@@ -36,9 +36,6 @@ LAW, OBSERVER, PLANT = range(3)
 
 #: Held while numba's settings are those of one law.
 COMPILING = threading.Lock()
-
-#: Trains integrated together where they do not hear each other: few enough for the second cache, enough to share the calls.
-TOGETHER = 64
 
 
 class Parts(NamedTuple):
@@ -252,14 +249,13 @@ def talking(air):  # type: ignore[no-untyped-def]
 
 @bare()
 def advance_kernel(  # type: ignore[no-untyped-def]
-    code, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes, begin, end
+    code, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes, blocks
 ):  # fmt: skip
-    """See ``advance``. Trains that do not hear each other meanwhile are taken a few at a time, so that they stay in the cache."""
-    size = end - begin if talking(air) else TOGETHER
-    for low in range(begin, end, max(size, 1)):
+    """See ``advance``. ``blocks`` are the trains that blocks begin with, and the one behind the last: each stays in the cache."""
+    for k in range(len(blocks) - 1):
         stretch(
-            code, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes, low,
-            min(low + size, end),
+            code, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes, blocks[k],
+            blocks[k + 1],
         )  # fmt: skip
 
 
@@ -358,7 +354,24 @@ def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...], ex
         return Parts(code, advance_kernel, exchange_kernel)
     loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes = (typeof(a) for a in arguments)
     text = types.literal(code)
-    to_advance = (text, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes, n, n)
+    to_advance = (
+        text,
+        loop,
+        first,
+        length,
+        links,
+        references,
+        air,
+        t,
+        h,
+        n,
+        breaks,
+        own,
+        estimate,
+        work,
+        extremes,
+        typeof(np.zeros(0, np.int64)),
+    )
     to_exchange = (text, loop, first, links, references, air, t, own, estimate, work)
     place = hashlib.sha256(" ".join(m.__file__ for m in (law, observer, plant)).encode()).hexdigest()[:16]
     exchange = from_cache(exchange_kernel, place, to_exchange) if exchanges else exchange_kernel
@@ -381,26 +394,25 @@ def from_cache(kernel: Any, place: str, arguments: tuple[Any, ...]) -> Callable[
 
 def advance(
     parts: Parts, loop: Inner, first: Ints, length: Floats, links: Links, references: References, air: Air, t: float, h: float,
-    n: int, breaks: Floats, own: Floats, estimate: Floats, work: Scratch, extremes: Extremes, shares: Shares | None = None,
+    n: int, breaks: Floats, own: Floats, estimate: Floats, work: Scratch, extremes: Extremes, shares: Shares = ALONE,
 ) -> Floats:  # fmt: skip
     """Integrate ``own`` and ``estimate`` in place over ``n`` classic Runge-Kutta steps of ``h`` seconds from ``t``.
 
     Steps are split at ``breaks`` (ascending times where the reference or a fault jumps): across a jump the order of the
-    integrator is lost. Returns the forces applied at ``t``, shape (U,). ``shares`` are those of several threads.
+    integrator is lost. Returns the forces applied at ``t``, shape (U,). ``shares`` are the trains by threads, and by blocks.
 
     The arguments must be of the types ``compiled`` was given (a float stays a float): nothing is checked here, since numba's own
     check of so many arguments takes 0.4 ms.
     """
-    ranges = ((0, len(first) - 1),) if shares is None else shares.ranges
+    mine, *others = shares.blocks or (np.array([0, len(first) - 1]),)
     over_it, further = (t, h, n, breaks, own, estimate), []
-    for low, high in ranges[1:]:
-        assert shares is not None and shares.pool is not None
+    for blocks in others:
+        assert shares.pool is not None
         space = {name: getattr(loop.law, name).copy() for name in shares.space}
         apart = loop._replace(law=loop.law._replace(**space)) if space else loop
-        of_its_own = work._replace(leader=np.zeros(4))
-        arguments = (apart, first, length, links, references, air, *over_it, of_its_own, extremes, low, high)
+        arguments = (apart, first, length, links, references, air, *over_it, work._replace(leader=np.zeros(4)), extremes, blocks)
         further.append(shares.pool.submit(parts.advance, parts.code, *arguments))
-    parts.advance(parts.code, loop, first, length, links, references, air, *over_it, work, extremes, *ranges[0])
+    parts.advance(parts.code, loop, first, length, links, references, air, *over_it, work, extremes, mine)
     for one in further:
         one.result()
     return work.applied_first.copy()

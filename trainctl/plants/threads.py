@@ -19,14 +19,21 @@ THREADS = "TRAINCTL_THREADS"
 #: A thread takes at least so many trains: for fewer it is not worth the 50 us of a call.
 LEAST = 64
 
+#: Trains are integrated so many at a time, or a formation: few enough for the cache, enough to share the calls.
+TOGETHER = 64
+
 
 class Shares(NamedTuple):
     """Which thread integrates which trains."""
 
-    ranges: tuple[tuple[int, int], ...]  # first train and the one behind the last
-    order: Ints  # (n,) as ``Links.order``, share by share
+    blocks: tuple[Ints, ...]  # of each thread: the trains that its blocks begin with, and the one behind the last
+    order: Ints  # (n,) as ``Links.order``, block by block
     space: tuple[str, ...] = ()  # fields of the law's constants of which each thread needs its own
     pool: ThreadPoolExecutor | None = None  # of all threads but the calling one
+
+
+#: One thread that takes all trains at once.
+ALONE = Shares((), np.zeros(0, np.int64))
 
 
 def cores() -> int:
@@ -36,7 +43,7 @@ def cores() -> int:
 
 
 def shares(first: Ints, links: Links, talk: bool, threads: int) -> Shares:
-    """Cut trains into ranges of about as many units each, between trains that do not hear each other.
+    """Cut trains into blocks, between trains that do not hear each other, and share these out by the units they have.
 
     Parameters
     ----------
@@ -47,7 +54,7 @@ def shares(first: Ints, links: Links, talk: bool, threads: int) -> Shares:
     talk : bool
         Whether they do within a stretch of integration; else trains may be cut anywhere.
     threads : int
-        At most so many ranges.
+        At most so many shares.
     """
     n = len(first) - 1
     crossed = np.zeros(n + 2, np.int64)  # links over the cut before each train
@@ -55,10 +62,15 @@ def shares(first: Ints, links: Links, talk: bool, threads: int) -> Shares:
         np.add.at(crossed, np.minimum(links.sender, links.receiver) + 1, 1)
         np.add.at(crossed, np.maximum(links.sender, links.receiver) + 1, -1)
     cuts = np.flatnonzero(np.cumsum(crossed)[: n + 1] == 0)
+    bounds = [0]
+    for cut in cuts.tolist():
+        if cut - bounds[-1] >= TOGETHER:
+            bounds.append(cut)
+    blocks = np.array([*bounds, *([n] if bounds[-1] < n else [])], np.int64)
     number = max(min(threads, n // LEAST), 1)
     wanted = first[-1] * np.arange(1, number) / number
-    nearest = np.abs(first[cuts][None, :] - wanted[:, None]).argmin(axis=1)
-    bounds = np.unique([0, *cuts[nearest].tolist(), n])
-    share = np.searchsorted(bounds, links.order, side="right")
-    ranges = tuple(zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True))
-    return Shares(ranges, links.order[np.argsort(share, kind="stable")])
+    ends = np.unique(np.abs(first[blocks][None, :] - wanted[:, None]).argmin(axis=1))
+    parts = [part for part in np.split(np.arange(len(blocks) - 1), ends) if len(part)]
+    block = np.searchsorted(blocks, links.order, side="right")
+    order = links.order[np.argsort(block, kind="stable")]
+    return Shares(tuple(blocks[part[0] : part[-1] + 2].copy() for part in parts), order)

@@ -228,7 +228,7 @@ class Units:
         own_space: tuple[str, ...] | None = getattr(self.law, "WORK", None)
         most = 1 if own_space is None else threads.cores()
         found = threads.shares(self.p.consists.first, links, self.law.MESSAGE > 0 and self.period is None, most)
-        if len(found.ranges) == 1:
+        if len(found.blocks) == 1:
             return found
         if self.pool is None:
             self.pool = ThreadPoolExecutor(most - 1, "trains")
