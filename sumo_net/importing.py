@@ -233,7 +233,7 @@ def _ttobench_track(data: Place, options: Options) -> Imported:
         stops = [(s.number(minimum=0.0) * factor, f"stop {k}") for k, s in enumerate(data["stops"]["values"].items(), 1)]
     length = options.length_m if options.length_m is not None else stops[-1][0] if stops else None
     if length is None:
-        raise data.wrong("missing, and it would tell the length of the line: give --length-m", "stops")
+        raise data.wrong("missing, so the length of the line is not known: give --length-m", "stops")
     speed = _steps(data["speed limits"], "velocity", "speed")
     gradient = _steps(data["gradients"], "slope", "slope") if data.has("gradients") else []
     notes = [f"{len(data[key]['values'].items())} {key} are left out" for key in ("curvatures", "tunnels") if data.has(key)]

@@ -392,7 +392,7 @@ def _crossing(
         try:
             foes = {int(row["index"]): row["foes"][::-1] for row in junction.requests}
         except (KeyError, ValueError):
-            raise LineError([f"{file}: junction {junction.attributes.get('id', '')}: its requests are broken"]) from None
+            raise LineError([f"{file}: junction {junction.attributes.get('id', '')}: its requests cannot be read"]) from None
         for (i, one), (j, other) in combinations(lanes, 2):
             same = twin[one[0]] == other[-1] and twin[one[-1]] == other[0]
             if same or one[0] == other[0] or one[-1] == other[-1]:

@@ -293,7 +293,7 @@ def _healthy_part(error: ValidationError, data: dict[str, Any]) -> tuple[LineSpe
 def violations(spec: LineSpec, numbers: Numbers | None = None) -> list[str]:
     """Every mistake that lies between the keys of a line, as ``key = value: rule``."""
     numbers = numbers or {}
-    found = [f"tracks = {t}: stands more than once" for t in dict.fromkeys(spec.tracks) if spec.tracks.count(t) > 1]
+    found = [f"tracks = {t}: appears more than once" for t in dict.fromkeys(spec.tracks) if spec.tracks.count(t) > 1]
     found += _profile_violations(spec, numbers)
     found += (regular := _regular_violations(spec))
     for label, c in _labelled(spec, numbers):
@@ -342,7 +342,7 @@ def _regular_violations(spec: LineSpec) -> list[str]:
         rule = f"must be longer than length_m = {r.length_m:g} by {SHORTEST_EDGE_M:g} m"
         found.append(f"regular_crossovers.every_m = {r.every_m:g}: {rule}")
     if not spec.begin_m + SHORTEST_EDGE_M <= r.first_m <= spec.end_m - r.length_m - SHORTEST_EDGE_M:
-        rule = f"the first lies not wholly inside the line, {text(spec.begin_m)} to {text(spec.end_m)} m"
+        rule = f"the first does not lie wholly inside the line, {text(spec.begin_m)} to {text(spec.end_m)} m"
         found.append(f"regular_crossovers.first_m = {text(r.first_m)}: {rule}")
     return found
 

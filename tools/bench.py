@@ -736,7 +736,7 @@ def main() -> None:
     parser.add_argument(
         "--only", action="append", choices=[*IN_SUMO, *NUMERIC, *SIGNALLED], help="this case; repeatable; default all"
     )
-    parser.add_argument("--repeats", type=int, help="repeats of each case, default 3; of pairs, default 10; the median is told")
+    parser.add_argument("--repeats", type=int, help="repeats of each case, default 3; of pairs, default 10; the median is shown")
     parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="compare with the code there; default 1000 trains")
     parser.add_argument("--instructions", action="store_true", help="count instructions with valgrind: repeatable, but slow")
     parser.add_argument("--logs", type=float, nargs="?", const=40.0, metavar="MB", help="how fast logs of this size are read")

@@ -28,7 +28,7 @@ Every number, bound and "validates that" sentence of the four papers, measured b
 | --- | --- |
 {chr(10).join(f"| {verdict} | {words} |" for verdict, words in VERDICTS.items())}
 
-A print error is charged to the rows it concerns directly; the other rows of that paper are measured with it corrected. Figures are
+A print error counts against the rows it concerns directly; the other rows of that paper are measured with it corrected. Figures are
 compared with what the text says of them, since their values are not in the text: times are taken to be good to 10 %. *measured* is
 what comes out here, in the unit of its row; where mistakes or violations are counted, 0 is success, and where a row is about the
 equations as printed, it shows what these give and the note says what is right. Laws, corrections and departures in full:

@@ -372,7 +372,7 @@ def main() -> int:
     options.add_argument("--only", action="append", default=[], help="runs whose name contains this; repeatable; default all")
     options.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs at a time; default one per processor")
     options.add_argument("--keep", type=Path, help="an empty folder for the runs; default they are thrown away")
-    options = commands.add_parser("compare", help="tell what differs; exit code 1 if anything does")
+    options = commands.add_parser("compare", help="show what differs; exit code 1 if anything does")
     options.add_argument("files", type=Path, nargs=2, metavar="FILE")
     options = commands.add_parser("nets")  # of a process of its own
     options.add_argument("folder", type=Path)

@@ -67,7 +67,7 @@ def run(
     backend : {"sumo", "numeric"}
         SUMO, or the same loop without a simulator.
     out : Path, optional
-        Run folder; default ``runs/NAME``, with settings ``runs/NAME+KEY=VALUE``. A run there is replaced, unless more than a run
+        Run folder; default ``runs/NAME``, with settings ``runs/NAME+KEY=VALUE``. An earlier run is replaced, unless more than a run
         lies there: by default it then goes to ``NAME-2``.
     force : bool
         Replace whatever lies there.
@@ -79,7 +79,7 @@ def run(
     Returns
     -------
     Run
-        Also of a run in which trains collided or locked each other: see ``Run.ok`` and ``Run.collisions``.
+        Also of a run in which trains collided or blocked each other: see ``Run.ok`` and ``Run.collisions``.
 
     Raises
     ------
@@ -203,7 +203,7 @@ class Simulation:
         scenario, backend, force, **settings
             As in ``run``.
         out : Path, optional
-            Run folder; default none, nothing stays.
+            Run folder; default none: nothing is kept.
         """
         model = open_scenario(str(scenario), settings)
         with ExitStack() as stack:
@@ -284,7 +284,7 @@ class Simulation:
         )  # fmt: skip
 
     def reference_of(self, train: str) -> tuple[float, float]:
-        """Position [m] along the train's own way and speed [m/s] of the reference it follows now.
+        """Position [m] along the train's own route and speed [m/s] of the reference it follows now.
 
         Where trains come and go that is the reference of its formation; a train in none is a reference of its own.
         """
@@ -295,7 +295,7 @@ class Simulation:
         return float(position - formed.offset[i]), float(speed)
 
     def step(self, steps: int = 1) -> float:
-        """Go on by so many steps; returns the time [s]."""
+        """Advance by that many steps; returns the time [s]."""
         for _ in range(steps):
             if not self._open or self.done:
                 raise InputError(f"the simulation has ended at {self.time:g} s: run.duration_s says how long it can go on")
@@ -306,7 +306,7 @@ class Simulation:
         """Drive trains from outside: from the next step on they are asked for this acceleration, not for the law's.
 
         The limits of the plant still apply, and so do the clamps of speed and input of a law that drives the train; the supervisor
-        acts as on anybody. A train in no formation is commanded like any other; one that stands at a stop stays there.
+        acts as on any other train. A train in no formation is commanded like any other; one that stands at a stop stays there.
 
         Parameters
         ----------
@@ -340,7 +340,7 @@ class Simulation:
         """Order a train onto another track, over the next crossover to it or over one named, or to an edge of the net.
 
         The order is followed at once, or where its front passes ``position_m``, or as soon as the gap to the train ahead or its
-        speed is below a value. One that cannot be followed is told as the event ``reroute_refused``, with the reason.
+        speed is below a value. One that cannot be followed is logged as the event ``reroute_refused``, with the reason.
 
         Raises
         ------

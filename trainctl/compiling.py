@@ -1,4 +1,4 @@
-"""How long compiling takes, and a word when it begins: laws are compiled once, and a run is not slower for it afterwards."""
+"""How long compiling takes, and a message when it begins: laws are compiled once, and later runs are not slower for it."""
 
 from __future__ import annotations
 

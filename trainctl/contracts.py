@@ -1,4 +1,4 @@
-"""What a law, an observer and a plant have to offer: modules of these shapes, which mypy checks.
+"""What a law, an observer and a plant must provide: modules of these shapes, which mypy checks.
 
 Counts used in shapes are those of ``signals``, whose values they take and give.
 """

@@ -1,6 +1,6 @@
 """Random numbers by name: each is a function of the seed, of what it is for, of whom it is for and of a count, as in [1]_.
 
-Nothing drawn before matters, nor who else there is: trains may come, go or change places, and everybody keeps his numbers.
+Nothing drawn before matters, nor who else there is: trains may come, go or change places, and every train keeps its numbers.
 
 References
 ----------

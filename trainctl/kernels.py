@@ -61,7 +61,7 @@ def _base() -> Path:
         except OSError:
             continue
     place = Path(tempfile.mkdtemp(prefix="trainctl-"))
-    warnings.warn(f"no folder of yours to keep compiled code in ({places[0]}): it is compiled anew in {place}", stacklevel=2)
+    warnings.warn(f"compiled code cannot be kept in {places[0]}: it is compiled again in {place}", stacklevel=2)
     return place
 
 

@@ -96,9 +96,12 @@ class Loop(Steps):
         own = self._measured(s)
 
         # orders: new routes first, since they change the rows of everybody
-        stops_in = supervisor.way_to_stop(
-            p.supervision, p.assumed, own[leading, SPEED], self.plant.acceleration(own), p.scenario.run.step_s, p.step_theta
-        )
+        def stops_in() -> Floats:
+            acceleration = self.plant.acceleration(own)
+            return supervisor.way_to_stop(
+                p.supervision, p.assumed, own[leading, SPEED], acceleration, p.scenario.run.step_s, p.step_theta
+            )
+
         ordered, routes = self.orders.step(
             t, world.measure(), world.ways, own[leading, SPEED], stops_in, s.formed.ahead, s.orders
         )  # fmt: skip

@@ -39,7 +39,7 @@ def controller(name: str, folder: Path) -> list[Path]:
     if not (name.isidentifier() and name.isascii() and name == name.lower()) or keyword.iskeyword(name):
         found.append(f"{name}: must be a Python identifier in lower case, e.g. my_law")
     elif name in laws():
-        found.append(f"{name}: there is a law of this name already")
+        found.append(f"{name}: a law of this name exists already")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         found.append(f"{folder}: exists and is not an empty folder: choose another --out")
     if found:

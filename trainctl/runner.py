@@ -101,7 +101,7 @@ def run(
         The run failed; ``out.partial`` keeps what was recorded, and run.json says why and when.
     """
     if p.self_driven and (backend != "sumo" or gui is not None or checkpoint_every_s is not None):
-        raise InputError("controller.law = sumo: SUMO drives by itself: no --backend numeric, --gui or --checkpoint-every")
+        raise InputError("controller.law = sumo: SUMO drives the trains itself: no --backend numeric, --gui or --checkpoint-every")
     with _opened(p, out, backend, force, command_line, gui, checkpoint_every_s) as simulation:
         simulation.run(progress)
     return Run(out)
@@ -122,7 +122,7 @@ def opened(
     When the block ends the run is complete; when it raises, the run failed.
     """
     if p.self_driven:
-        raise InputError("controller.law = sumo: SUMO drives by itself; `trainctl run` runs it")
+        raise InputError("controller.law = sumo: SUMO drives the trains itself; `trainctl run` runs it")
     with _opened(p, out, backend, force, command_line, gui, checkpoint_every_s) as simulation:
         assert isinstance(simulation, Loop)
         yield simulation
@@ -155,6 +155,8 @@ def _opened(
         write_info(partial, info)
         (partial / "scenario.toml").write_text(text, encoding="utf-8")
         keep_law(p, partial)
+        if backend == "numeric" and p.net is not None:
+            unpack(p.net, partial)  # where the trains were, for figures; SUMO keeps its own
         begin(partial, p, checkpoint_every_s, info)
         with _driven(p, partial, info, gui, checkpoint_every_s, None) as simulation:
             yield simulation
@@ -190,7 +192,7 @@ def resume(folder: Path, progress: Callable[[int, int], Any] | None = None) -> t
         if not ours(partial):
             if ours(out) and Run(out).info["status"] == "complete":
                 return Run(out), None
-            raise InputError(f"{partial}: no run that could be resumed; begin one with `trainctl run`")
+            raise InputError(f"{partial}: no run that could be resumed; start one with `trainctl run`")
         place = partial / checkpoint.FOLDER
         if Run(partial).info.get("status") == "complete" and not os.path.lexists(place / checkpoint.DONE):
             _whole(partial)
@@ -392,7 +394,7 @@ def again(partial: Path) -> tuple[Model, float | None, dict[str, Any]]:
     """
     place = partial / checkpoint.FOLDER
     if not os.path.lexists(place / checkpoint.START):
-        raise InputError(f"{partial}: it was killed before it began: begin it again with `trainctl run`")
+        raise InputError(f"{partial}: it was killed before it began: start it again with `trainctl run`")
     start = unsealed(place / checkpoint.START)
     for name, expected in start["files"].items():
         verify(partial / name, expected)

@@ -1,7 +1,7 @@
 """Checks that every sampled law must pass, for the author of one: what the contract in ``trainctl.signals`` says, as assertions.
 
-``check_sampled_law(my_law)`` runs all; ``CHECKS`` lists them for ``pytest.mark.parametrize``. Six point trains on one track hear
-their neighbours, with one link more and one train that receives nothing; the reference runs at 80 m/s.
+``check_sampled_law(my_law)`` runs all; ``CHECKS`` lists them for ``pytest.mark.parametrize``. Six point trains on one track receive
+from their neighbours, with one link more and one train that receives nothing; the reference runs at 80 m/s.
 """
 
 from __future__ import annotations

@@ -77,9 +77,11 @@ class Watched(Steps):
         """The state a step later."""
         world, now, t = self.world, self.world.measure(), self.time
         s = self._told(t, now, s)
-        stops_in = supervisor.stopping_distance(
-            np.maximum(now.speed, 0.0), self.rate, self.p.scenario.run.step_s, self.p.step_theta
-        )
+
+        def stops_in() -> Floats:
+            speed = np.maximum(now.speed, 0.0)
+            return supervisor.stopping_distance(speed, self.rate, self.p.scenario.run.step_s, self.p.step_theta)
+
         ordered, routes = self.orders.step(t, now.seen, world.ways, now.speed, stops_in, now.ahead, s.orders)
         for i, edges in routes:
             world.route(i, edges)
@@ -166,7 +168,7 @@ class Watched(Steps):
 
 
 def _nobody(trains: int) -> Links:
-    """Links of trains that hear nobody."""
+    """Links of trains that receive from none."""
     none, empty = np.zeros(0, np.int64), np.zeros(0)
     return Links(
         none, none, np.zeros(trains + 1, np.int64), empty, empty, empty, empty, np.zeros(0, bool), np.full(trains, np.nan),

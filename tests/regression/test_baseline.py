@@ -314,9 +314,9 @@ def test_what_was_recorded_stays_if_the_run_does_not_end(
 
 def test_it_drives_by_itself(tmp_path: Path) -> None:
     p = open_scenario("three_tracks", {"controller.law": "sumo"})
-    with pytest.raises(InputError, match="SUMO drives by itself"):
+    with pytest.raises(InputError, match="SUMO drives the trains itself"):
         runner.run(p, tmp_path / "run", backend="numeric")
-    with pytest.raises(InputError, match="SUMO drives by itself"), runner.opened(p, tmp_path / "run"):
+    with pytest.raises(InputError, match="SUMO drives the trains itself"), runner.opened(p, tmp_path / "run"):
         pass
 
 

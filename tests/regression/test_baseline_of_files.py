@@ -102,7 +102,7 @@ def test_trains_that_sumo_draws_otherwise_are_told(folder):
     told = [e["message"] for e in found.events if e["kind"] == "sumo_warning" and "not recorded" in e["message"]]
     assert ours < theirs and len(told) == 1 and told[0].startswith(f"{len(theirs - ours)} trains ")
     notes = [e["what"] for e in found.events if e["kind"] == "not_followed"]
-    assert "flows f: SUMO draws their trains itself, so none of them is planned for a time" in notes
+    assert "flows f: SUMO draws the departures itself, so these trains have no planned time" in notes
 
 
 def test_the_types_are_those_of_the_files(folder):

@@ -355,7 +355,7 @@ def test_what_trains_draw_goes_by_their_weights_and_their_names(bypass):
     asked = [e["to_edge"] for e in events(found, "reroute")]
     assert {"fc", "ec"} == set(asked) and len(asked) < 24 and asked.count("fc") > asked.count("ec")
     said = [e["what"] for e in events(found, "not_followed")]
-    assert "rerouter r: <destProbReroute>: drawn here, with other numbers than SUMO's" in said
+    assert "rerouter r: <destProbReroute>: drawn here, with random numbers other than SUMO's" in said
 
 
 def test_mistakes_in_what_trains_draw_from_are_told(bypass):

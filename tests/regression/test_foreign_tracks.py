@@ -68,7 +68,7 @@ def test_trains_run_where_everybody_may(tmp_path):
         assert [e for e in found.events if e["kind"] == "arrive"]
         count = 1 if marked else 2
         assert (
-            f"net: {count} x edges of routes let everybody on, no rail class by name: tracks without their road traffic"
+            f"net: {count} x edges of routes are open to all classes, to no rail class by name: taken for tracks without road traffic"
             in notes(folder)
         )
         assert "bc" in page(found)

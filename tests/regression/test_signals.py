@@ -120,7 +120,7 @@ def test_orders_of_the_scenario_are_handed_to_the_signals(tmp_path):
     assert order_of(at(free, "arrive"))[0] == "a"
     found = ran(tmp_path, 1500, [{"edge": "main", "trains": ["b", "a"]}], signals="obey")
     assert order_of(at(found, "arrive")) == ["b", "a", "c"] and not amiss(found)
-    with pytest.raises(InputError, match=r"order\[1\].trains: d: no rail signal on its way before edge main"):
+    with pytest.raises(InputError, match=r"order\[1\].trains: d: no rail signal on its route before edge main"):
         join(tmp_path, nets.train("a", WEST, 0) + nets.train("d", "main east", 60, departPos=200))
         ran(tmp_path, 1500, [{"edge": "main", "trains": ["d", "a"]}], signals="obey")
 

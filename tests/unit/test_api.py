@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import nets
 import numpy as np
@@ -250,6 +251,29 @@ def test_one_simulation_of_sumo_at_a_time_and_the_second_leaves_nothing(tmp_path
     with trainctl.Simulation.open("fully_distributed", **{"run.duration_s": 5}) as second:
         second.step(5)
         assert second.done
+
+
+@pytest.mark.parametrize("backend", ["numeric", "sumo"])
+def test_three_threads_run_at_once_or_are_told_and_the_next_run_is_as_ever(backend, tmp_path):
+    """Without SUMO all of them run; SUMO holds one run per process, and who comes too early gets one error, always the same."""
+
+    def run_in(name):
+        try:
+            done = trainctl.run("fully_distributed", backend=backend, out=tmp_path / name, **{"run.duration_s": 24})
+            return done.trains.to_csv()
+        except SimulatorError as error:
+            return error
+
+    alone = run_in("alone")
+    assert isinstance(alone, str)
+    with ThreadPoolExecutor(3) as threads:
+        came = list(threads.map(run_in, "abc"))
+    ran = [one for one in came if isinstance(one, str)]
+    assert set(ran) == {alone} and len(ran) >= (3 if backend == "numeric" else 1)
+    assert {str(one) for one in came if isinstance(one, SimulatorError)} <= {
+        "SUMO already runs in this process; it can hold one simulation at a time"
+    }
+    assert run_in("after") == alone
 
 
 def test_an_error_in_the_users_loop_marks_the_run_as_failed(tmp_path):

@@ -221,5 +221,10 @@ def test_links_lead_somewhere(page):
             assert ((ROOT / page).parent / target).exists(), f"{page}: {target}"
 
 
+def test_the_readme_fits_two_screens():
+    """Of 60 lines each; a picture in it takes a third of one."""
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 120
+
+
 def test_the_picture_is_small():
     assert 5_000 < (ROOT / "scenarios/three_tracks.png").stat().st_size < 200_000

@@ -50,11 +50,11 @@ sys.meta_path.insert(0, Nowhere())
 {SEVERAL}"""
 
 
-def typed(code: str, lines: Iterable[str], folder: Path, python: str = sys.executable, **more: Any) -> list[tuple[int, str]]:
+def typed(code: str, lines: Iterable[str], folder: Path, *python: str, **more: Any) -> list[tuple[int, str]]:
     """Exit code and words on stderr of every command."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
-        [python, "-c", code, *lines],
+        [*(python or (sys.executable,)), "-c", code, *lines],
         cwd=folder,
         capture_output=True,
         text=True,
@@ -121,8 +121,14 @@ def readable(path: str) -> bool:
     return all(place.stat().st_mode & 0o005 == 0o005 for place in (real, *real.parents, *Path(path).absolute().parents))
 
 
+def without_network() -> tuple[str, ...]:
+    """What takes the network from a command, where this machine lets us."""
+    tried = subprocess.run(["unshare", "--net", "true"], check=False, stderr=subprocess.DEVNULL)
+    return ("unshare", "--net") if tried.returncode == 0 else ()
+
+
 def test_another_user_without_a_home_works_with_a_package_that_cannot_be_written(tmp_path_factory):
-    """Nothing but one folder is writable: list, check, run, plot, report, diff."""
+    """Nothing but one folder is writable, and there is no network: list, check, run, plot, report, diff."""
     python, site = strangers_python(), str(Path(pytest.__file__).parents[1])
     if not readable(site):
         pytest.skip("the packages are in a folder that another user may not read")
@@ -139,8 +145,8 @@ def test_another_user_without_a_home_works_with_a_package_that_cannot_be_written
             "list", "check fully_distributed", "run fully_distributed --set run.duration_s=20 --out run -q", "plot run", "report run",
             "diff run run",
         )  # fmt: skip
-        stranger = {"env": environment, "user": NOBODY, "group": NOBODY, "extra_groups": []}
-        for line, (number, said) in zip(lines, typed(code, lines, place / "work", python, **stranger), strict=True):
+        stranger = (*without_network(), "setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups", python)
+        for line, (number, said) in zip(lines, typed(code, lines, place / "work", *stranger, env=environment), strict=True):
             assert number == 0, f"{line}: {said}"
         assert not list((place / "package").rglob("*.nb?")) and not list((place / "package").rglob("__pycache__"))
         assert (place / "work/run/report.html").exists() and list((place / "work/run/figures").iterdir())

@@ -38,7 +38,7 @@ def group(
     heads: tuple[float, ...] = (108.8e3, 105e3, 102.2e3),
     speeds: tuple[float, ...] = (295 * KMH, 275 * KMH, 285 * KMH),
 ) -> Scene:  # fmt: skip
-    """The paper's trains, slots 3000 m apart tail to head."""
+    """The paper's trains, slots 3000 m apart rear to front."""
     rows = trains * units
     one, endless = np.ones(rows), np.full(rows, np.inf)
     coupled = np.arange(1, rows + 1) % units != 0
@@ -341,7 +341,7 @@ def theorem(runs: Runs) -> Iterator[Claim]:
     )
     yield claim(
         "Theorem 1 from other starts: random starts from which (10) to (12) hold", len(starts), good, "1", good == len(starts),
-        "heads up to 500 m off, speeds 15 m/s off, couplers at rest; errors below 1 cm/s and 10 cm at 700 s; with the corrected (8), (9), R3", corrected=True,
+        "leading units up to 500 m off, speeds 15 m/s off, couplers at rest; errors below 1 cm/s and 10 cm at 700 s; with the corrected (8), (9), R3", corrected=True,
     )  # fmt: skip
     example = lyapunov(runs.example)[:593]
     rise = max([float(np.diff(example).max() / example[0]), *(s.rise for s in starts)])

@@ -288,7 +288,7 @@ def formation(runs: Runs) -> Iterator[Claim]:
     final = float(calm.spread[-1])
     settled = (int(np.flatnonzero(calm.spread > 1.0)[-1]) + 2) * T
     yield claim("without disturbance the desired formation is reached (Fig. 5b): error of the worst pair at 1000 s", 0, final, "m", final < 1e-3,
-                f"within 1 m from {settled:.5g} s; the graph is drawn in Fig. 1 and not in the text: taken, neighbours hear each other")  # fmt: skip
+                f"within 1 m from {settled:.5g} s; the graph is drawn in Fig. 1 and not in the text: assumed: neighbours receive from each other")  # fmt: skip
     error, nearest = float(kicked.spread[-1]), float(kicked.neighbours[-1].max())
     steady = robust_gain.steady_state(H, kicked.scene, AMPLITUDE)
     predicted = float(np.abs(steady.error_m).max())

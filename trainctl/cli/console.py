@@ -41,7 +41,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-networks = typer.Typer(help="Rail networks: list, build, show.", no_args_is_help=True)
+networks = typer.Typer(help="Rail networks: list, build, show, import.", no_args_is_help=True)
 app.add_typer(networks, name="net")
 
 

@@ -1,4 +1,4 @@
-"""Commands that lead out of the package: a new law, logs for other programs, a run shown again."""
+"""Commands for work outside of the package: a new law, logs for other programs, a run replayed."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def replay(
     delay_ms: Annotated[float, typer.Option(help="Minimum time of a step on the screen [ms].")] = 20.0,
     gui_program: Annotated[str, typer.Option(help="The program to start; sumo is the same without a window.")] = "sumo-gui",
 ) -> None:
-    """Show a run again in sumo-gui, as it was recorded."""
+    """Replay a run in sumo-gui, as it was recorded."""
     from trainctl.runs.run import Run
     from trainctl.sumo.replay import replay as show
 

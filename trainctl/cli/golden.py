@@ -28,7 +28,7 @@ Golden = Annotated[Path, typer.Argument(help="Folder of the golden.")]
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    golden = typer.Typer(help="Keep a run or logs as a golden, and hold later ones against it.", no_args_is_help=True)
+    golden = typer.Typer(help="Keep a run or logs as a golden, and compare later ones with it.", no_args_is_help=True)
     app.add_typer(golden, name="golden")
 
     @golden.command()
@@ -59,7 +59,7 @@ def register(app: typer.Typer) -> None:
         junit: Junit = None,
         html: Html = None,
     ) -> None:
-        """Hold a run or logs against their golden: the same as `trainctl diff GOLDEN SOURCE`; exit 1 if they differ."""
+        """Compare a run or logs with their golden: the same as `trainctl diff GOLDEN SOURCE`; exit 1 if they differ."""
         chosen = chosen_tolerances(tolerances, tolerance, time_tolerance, zero)
         compared(golden, source, chosen, chosen_form(form, as_json, rows), rows, junit, html, False)
 
@@ -72,6 +72,6 @@ def register(app: typer.Typer) -> None:
         time_tolerance: InTime = None,
         zero: Zero = False,
     ) -> None:
-        """Show what moves, and write the golden anew: the same as `trainctl diff GOLDEN SOURCE --accept`."""
+        """Show what moves, and renew the golden: the same as `trainctl diff GOLDEN SOURCE --accept`."""
         chosen = chosen_tolerances(tolerances, tolerance, time_tolerance, zero)
         compared(golden, source, chosen, "text", False, None, None, True)

@@ -27,7 +27,7 @@ def net_import(
     item: Annotated[str | None, typer.Option(help="Id of the path or train, where the file has several.")] = None,
     tracks: Annotated[int, typer.Option(min=1, max=20, help="Lines: number of parallel tracks.")] = 1,
     length_m: Annotated[
-        float | None, typer.Option(min=0.1, help="Length of the line, or of the train, where the file does not tell it [m].")
+        float | None, typer.Option(min=0.1, help="Length of the line, or of the train, where the file does not state it [m].")
     ] = None,
     before_m: Annotated[float, typer.Option(min=0.0, help="Lines: level track added before the beginning [m].")] = 0.0,
     after_m: Annotated[float, typer.Option(min=0.0, help="Lines: level track added beyond the end [m].")] = 0.0,

@@ -41,7 +41,7 @@ def run(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Run folder; default runs/NAME, with --set runs/NAME+KEY=VALUE. A run there is replaced, unless more than a run"
+            help="Run folder; default runs/NAME, with --set runs/NAME+KEY=VALUE. An earlier run is replaced, unless more than a run"
             " lies there: then it goes to NAME-2."
         ),
     ] = None,
@@ -63,7 +63,8 @@ def run(
 ) -> None:
     """Run a scenario into a run folder: logs, metrics, SUMO's own logs.
 
-    Exit 1 if trains collided or waited for each other in a circle; with the supervisor on also if one was too fast for its line.
+    Exit 1 if trains collided or waited for each other in a circle, and with the supervisor on also if one was too fast for its
+    line.
     A law that is a file is a program: it is executed.
     """
     from trainctl import runner
@@ -157,7 +158,7 @@ def check(name: ScenarioName = DEFAULT_SCENARIO, settings: Settings = None, as_j
     A law that is a file is a program: it is executed.
     """
     model = named(name, settings)
-    from trainctl.scenario.check import facts
+    from trainctl.scenario.check import facts, in_words
 
     found = facts(model)
     if as_json:
@@ -166,9 +167,8 @@ def check(name: ScenarioName = DEFAULT_SCENARIO, settings: Settings = None, as_j
     say(f"{model.file}: no mistakes, no start condition of {model.scenario.controller.law} violated")
     table = listing(None, "", "")
     table.show_header = False
-    for key, value in found.items():
-        if key not in ("warnings", "report", "analysis", "protection", "promise"):
-            fill(table, key, str(value))
+    for row in in_words(found):
+        fill(table, *row)
     show(table)
     for k, line in enumerate(found.get("promise", ())):
         say(f"protection: {line}" if not k else f"  - {line}")

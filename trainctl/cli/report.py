@@ -41,11 +41,11 @@ def report(
 def film(
     folder: Annotated[Path, typer.Argument(help="Run folder, as `trainctl run` made it.")],
     out: Annotated[Path | None, typer.Option(help="The file, .gif or .webp; default FOLDER/film.gif.")] = None,
-    seconds: Annotated[float, typer.Option(min=0.2, max=120.0, help="How long the picture lasts.")] = 15.0,
+    seconds: Annotated[float, typer.Option(min=0.2, max=120.0, help="How long the animation lasts [s].")] = 15.0,
     from_s: Annotated[float | None, typer.Option(help="Begin at this time of the run in s.")] = None,
     until_s: Annotated[float | None, typer.Option(help="End at this time of the run in s.")] = None,
 ) -> None:
-    """Write the trains on their tracks as a moving picture, for slides: GIF or WebP."""
+    """Write an animation of the trains on their tracks, for slides: GIF or WebP."""
     from trainctl.report.film import film as write
     from trainctl.runs.run import Run
 
@@ -57,7 +57,7 @@ def compare(
         list[str],
         typer.Argument(
             metavar="RUN...",
-            help="Run folders; with --controllers all one scenario; or the word capacity, spacing or suite (./suite is a folder).",
+            help="Run folders; with --controllers all one scenario; or capacity, spacing or suite (./suite is a folder).",
         ),
     ],
     controllers: Annotated[
@@ -84,36 +84,43 @@ def compare(
     ] = None,
     spacings: Annotated[
         Path | None,
-        typer.Option(help="spacing.json of `trainctl compare spacing`: laws keep what it found.", rich_help_panel=CAPACITY),
+        typer.Option(
+            help="spacing.json of `trainctl compare spacing`: each law keeps the spacing found there.", rich_help_panel=CAPACITY
+        ),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Rows at a time; default one per core.", rich_help_panel=CAPACITY)
     ] = None,
     rows_: Annotated[
-        str | None, typer.Option("--rows", metavar="ROW,...", help="Only these rows; with suite too.", rich_help_panel=SPACING)
+        str | None, typer.Option("--rows", metavar="ROW,...", help="Only these rows; also with suite.", rich_help_panel=SPACING)
     ] = None,
     stops: Annotated[int | None, typer.Option(help="Emergency stops; default 200.", rich_help_panel=SPACING)] = None,
     searched: Annotated[
-        int | None, typer.Option(help="The first so many of them are searched with; default 20.", rich_help_panel=SPACING)
+        int | None, typer.Option(help="How many of them, the first ones, the search uses; default 20.", rich_help_panel=SPACING)
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of what is random in them; default 1.", rich_help_panel=SPACING)] = None,
-    loss: Annotated[float | None, typer.Option(help="Messages lost in good times; default 0.02.", rich_help_panel=SPACING)] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of everything random in them; default 1.", rich_help_panel=SPACING)] = None,
+    loss: Annotated[
+        float | None, typer.Option(help="Share of messages lost in good times; default 0.02.", rich_help_panel=SPACING)
+    ] = None,
     delay_s: Annotated[float | None, typer.Option(help="Age of messages in s; default 1.", rich_help_panel=SPACING)] = None,
     bad_s: Annotated[
-        float | None, typer.Option(help="Mean length of times when none arrives in s; default 3, 0: none.", rich_help_panel=SPACING)
+        float | None,
+        typer.Option(
+            help="Mean length of times in which no message arrives, in s; default 3; 0: there are none.", rich_help_panel=SPACING
+        ),
     ] = None,
     brake_scatter: Annotated[
         float | None, typer.Option(help="Share by which brakes scatter, either way; default 0.05.", rich_help_panel=SPACING)
     ] = None,
     runs_: Annotated[int | None, typer.Option("--runs", help="Runs of each cell; default 20.", rich_help_panel=SUITE)] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with what is in --out; with spacing too.", rich_help_panel=SUITE)
+        bool, typer.Option("--resume", help="Continue what is in --out; also with spacing.", rich_help_panel=SUITE)
     ] = False,
     in_sumo: Annotated[
         bool, typer.Option("--in-sumo", help="Check the spacings that were found in SUMO as well.", rich_help_panel=SPACING)
     ] = False,
 ) -> None:
-    """Compare runs: one table, also in LaTeX, and figures with all of them in one axis.
+    """Compare runs: one table, also in LaTeX, and figures that show all of them on common axes.
 
     `trainctl compare capacity` runs the same trains on the same line under SUMO's fixed block and moving block and under every law:
     headway, trains per hour, journey time, energy, collisions.

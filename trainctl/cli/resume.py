@@ -22,9 +22,10 @@ def resume(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no summary.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")] = False,
 ) -> None:
-    """Go on with a run that was killed, from its last checkpoint (`trainctl run --checkpoint-every S`).
+    """Resume a run that was killed, from its last checkpoint (`trainctl run --checkpoint-every S`).
 
-    It ends with the same files, and the same exit code, as a run that was not killed. Without checkpoints it begins again.
+    It ends with the same files, and the same exit code, as a run that was not killed. Without checkpoints it starts again from the
+    beginning.
     A law that is a file is a program: it is executed.
     """
     from trainctl import runner

@@ -23,13 +23,17 @@ def register(app: typer.Typer) -> None:
         name: Annotated[str, typer.Argument(help="Scenario, or a ready-made sweep such as monte_carlo: name or path of a TOML.")],
         settings: Annotated[
             list[str] | None,
-            typer.Option("--set", metavar="KEY=A,B,...", help="Values of a key; several --set are combined, each with each."),
+            typer.Option(
+                "--set",
+                metavar="KEY=A,B,...",
+                help="Values of a key; of several --set every value is combined with every other one.",
+            ),
         ] = None,
         seeds: Annotated[str | None, typer.Option(metavar="0..99", help="Seeds; each combination runs with each of them.")] = None,
         jitter: Annotated[
             list[str] | None,
             typer.Option(
-                metavar="train.KEY=W", help="Move a number of every train by up to W either way, by the seed. Repeatable."
+                metavar="train.KEY=W", help="Change a number of every train by up to W either way, drawn by the seed. Repeatable."
             ),
         ] = None,
         out: Annotated[Path | None, typer.Option(help="Folder of the sweep; default sweeps/NAME.")] = None,
@@ -38,7 +42,7 @@ def register(app: typer.Typer) -> None:
             str | None, typer.Option(metavar="ADDRESS", help="A running Dask scheduler instead: tcp://..., or its .json file.")
         ] = None,
         backend: Annotated[Literal["sumo", "numeric"], typer.Option(help="SUMO, or the same loop without a simulator.")] = "sumo",
-        resume: Annotated[bool, typer.Option("--resume", help="Go on with the sweep in --out; what is done stays.")] = False,
+        resume: Annotated[bool, typer.Option("--resume", help="Continue the sweep in --out; finished runs stay.")] = False,
         force: Annotated[bool, typer.Option("--force", help="Replace whatever lies at --out.")] = False,
         keep: Annotated[
             bool, typer.Option("--keep", help="Keep all run folders in OUT/runs (workers need the same file system).")

@@ -30,20 +30,20 @@ def register(app: typer.Typer) -> None:
         jitter: Annotated[
             list[str] | None,
             typer.Option(
-                metavar="train.KEY=W", help="Move a number of every train by up to W either way, by the seed. Repeatable."
+                metavar="train.KEY=W", help="Change a number of every train by up to W either way, drawn by the seed. Repeatable."
             ),
         ] = None,
         settings: Annotated[
             list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value of a key of the scenario. Repeatable.")
         ] = None,
-        evaluations: Annotated[int, typer.Option(help="So many candidates at most.")] = 100,
+        evaluations: Annotated[int, typer.Option(help="Maximum number of candidates.")] = 100,
         out: Annotated[Path | None, typer.Option(help="Folder of the search; default tune/NAME.")] = None,
         workers: Annotated[int | None, typer.Option(min=1, help="Processes; default one per core.")] = None,
         force: Annotated[bool, typer.Option("--force", help="Replace whatever lies at --out.")] = False,
         quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False,
         as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")] = False,
     ) -> None:
-        """Look for the gains of a law that make an objective smallest while every bound is kept in all of many disturbed runs.
+        """Search for gains of a law that minimise an objective while every bound is kept in all of many disturbed runs.
 
         OUT gets tuned.toml (the scenario with the best gains), search.parquet and search.png (all candidates), and tune.json.
         Exit 1 if no candidate kept all bounds.

@@ -35,7 +35,7 @@ PLACE, SAID_SPEED, SAID_ACCELERATION, SAID_REFERENCE, SAID_BRAKING, SAID = range
 
 
 class Followed(NamedTuple):
-    """The nearest train ahead that each train hears, shape (n,)."""
+    """The nearest train ahead that each train receives from, shape (n,)."""
 
     follows: Bools  # there is one
     row: Ints  # of the link; 0 where there is none
@@ -54,7 +54,7 @@ class Seen(NamedTuple):
 
 
 def followed(scene: Scene) -> Followed:
-    """Whom every train follows: of those it hears ahead of it the one with the smallest desired spacing."""
+    """Whom every train follows: of those ahead that it receives from the one with the smallest desired spacing."""
     links, n = scene.links, len(scene.trains)
     rows = np.flatnonzero(links.desired > 0.0)
     rows = rows[np.lexsort((links.desired[rows], links.receiver[rows]))]
@@ -139,7 +139,7 @@ def fastest(reference: Reference) -> float:
 
 
 def named(scene: Scene, who: Followed, i: int) -> str:
-    """The link on which train ``i`` hears the one it follows, as mistakes name it."""
+    """The link on which train ``i`` receives from the one it follows, as mistakes name it."""
     return f"link[{scene.trains[scene.links.sender[who.row[i]]]},{scene.trains[i]}]"
 
 

@@ -1,14 +1,14 @@
 """Finite-time cooperative cruise of EMU groups: Wei, Ge and Wu, Control Theory & Applications 2022 (5).
 
-Every power unit is an agent: it hears its neighbours in the train, heads and tails hear the next train, and every head knows the
-virtual leader. With ``alpha_1 = 1`` this is the ordinary consensus the paper compares with.
+Every power unit is an agent: it receives from its neighbours in the train, first and last units from the next
+train, and every head knows the virtual leader. With ``alpha_1 = 1`` this is the ordinary consensus the paper compares with.
 
 Symbols
 -------
 x, v         position of a unit's front [m], its speed [m/s]
-xt, vt       position and speed relative to the wanted ones (x, v with tilde), eq. (8)
+xt, vt       position and speed relative to the desired ones (x, v with tilde), eq. (8)
 e            stretch of a coupler [m], eq. (1): difference of xt between its units
-s, ls, le    clear distance tail to head, its wanted value, the emergency distance [m], eq. (9)
+s, ls, le    clear distance rear to front, its desired value, the emergency distance [m], eq. (9)
 z            s - ls [m]: difference of xt between the tail ahead and the head behind
 k_hat        coupler stiffness per mass [1/s2]
 h1, h2       largest stretch and compression of a coupler [m]
@@ -137,7 +137,7 @@ class Constants(NamedTuple):
 
 
 def constants(params: Params, scene: Scene) -> Constants:
-    """Pack gains and units; of who hears whom it takes the number of links only."""
+    """Pack gains and units; of who receives from whom it takes the number of links only."""
     c = scene.consists
     most = int((np.diff(c.first) + np.diff(scene.links.first)).max(initial=0))
     terms = np.zeros((4, -(-most // BLOCK) * BLOCK))
@@ -195,13 +195,13 @@ def demand(
     leader : ndarray, shape (4,)
         Position, speed, ... of the virtual leader.
     slot : float
-        Wanted position of the head relative to the leader [m]; the offsets of eq. (8).
+        Nominal position of the leading unit relative to the leader [m]; the offsets of eq. (8).
     age, estimate, correction : float, ndarray, ndarray
         Not used: held messages stay as they are, and there is no observer.
     own : ndarray, shape (units, 2)
         Position [m] and speed [m/s].
     desired : ndarray, shape (k,)
-        Wanted spacing of each link, front to front, positive if the sender is ahead [m].
+        Desired spacing of each link, front to front, positive if the sender is ahead [m].
     heard : ndarray, shape (k, 5)
         Messages.
     out : ndarray, shape (units,)
@@ -277,7 +277,7 @@ def message(
 
 @inlined()
 def watch(i: int, constants: Constants, leader: Floats, first: Ints, own: Floats, links: Links, out: Floats) -> None:
-    """Write the clear distance to the train ahead [m], eq. (9), into ``out`` (1,): NaN if train ``i`` hears none."""
+    """Write the clear distance to the train ahead [m], eq. (9), into ``out`` (1,): NaN if train ``i`` receives from none."""
     out[0] = np.nan
     for k in range(links.first[i], links.first[i + 1]):
         if links.desired[k] > 0.0:

@@ -90,12 +90,12 @@ def link_violations(params: Params, scene: Scene) -> list[str]:
             found.append(f"{where}: interval = {s:.1f} m: must start above emergency_distance_m = {le:g} (Theorem 1)")
         if not ls - le > params.emergency_zone_m:
             found.append(
-                f"{where}: wanted interval = {ls:g} m: must exceed emergency_distance_m + emergency_zone_m = "
+                f"{where}: desired interval = {ls:g} m: must exceed emergency_distance_m + emergency_zone_m = "
                 f"{le + params.emergency_zone_m:g}"
             )
         if not beta - ls > params.range_zone_m:
             found.append(
-                f"{where}: wanted interval = {ls:g} m: must be below range_m - range_zone_m = {beta - params.range_zone_m:g}"
+                f"{where}: desired interval = {ls:g} m: must be below range_m - range_zone_m = {beta - params.range_zone_m:g}"
             )
         gap = abs(scene.links.slot[front] - scene.links.slot[rear] - abs(desired))
         if gap > 1e-6:

@@ -188,7 +188,7 @@ def resolved(params: Params, lower: float, upper: float, step: float, train: int
 
 @inlined()
 def ahead(desired: Floats) -> int:
-    """Row of the nearest train ahead among the links of one train, -1 if it hears none from ahead."""
+    """Row of the nearest train ahead among the links of one train, -1 if it receives from none ahead."""
     best = -1
     for k in range(len(desired)):
         if desired[k] > 0.0 and (best < 0 or desired[k] < desired[best]):

@@ -1,6 +1,6 @@
 """Fully distributed control of constrained discrete-time trains [1]_: spacing, speed and input bounds kept at every step.
 
-Each train hears only its neighbours. It predicts where it will be one period ahead, moves towards the mean of its links'
+Each train receives only from its neighbours. It predicts where it will be one period ahead, moves towards the mean of its links'
 errors, and clips that move s to half of the room its links leave, to the room of its speed and to that of its input. The law is
 a deadbeat speed command, ``v_i(k+1) = v_r + s_i / T``.
 
@@ -142,7 +142,7 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
     leader : ndarray, shape (4,)
         Position [m], speed [m/s], ... of the virtual leader.
     links : Links
-        Who hears whom, desired spacings and their bounds [m].
+        Who receives from whom, desired spacings and their bounds [m].
     heard : ndarray, shape (L, 1)
         The neighbours' ``z`` [m]. Rows not heard may hold anything.
 

@@ -25,16 +25,16 @@ that the problem is a quadratic programme. DAQP [2]_ solves it by an active set:
 constraints. It starts from the constraints that were active in the plan before.
 
 What is not feasible -------------------- Where no plan keeps all constraints (a train ahead that breaks its plan, a message that
-came too late), the train brakes fully, and the column ``saturated`` tells so, in that period alone. A speed outside of its bounds
+came too late), the train brakes fully, and the column ``saturated`` is set, in that period alone. A speed outside of its bounds
 widens them to what it is.
 
 Departures
 ----------
 * [1]_ has a terminal set; here the bound on the first acceleration makes sure that a feasible plan exists in the next period as
   well.
-* A train that does not do what it planned, for its brakes are ordered by somebody else or its actuators are at their limits,
+* A train that does not do what it planned, since its brakes are ordered from elsewhere or its actuators are at their limits,
   sends that it goes on as it does: [1]_ leaves this open.
-* Old messages are carried forward, see ``ahead``, and the plan in them with them. Who follows nobody plans behind the reference.
+* Old messages are carried forward, see ``ahead``, and the plan in them with them. One that follows none plans behind the reference.
 
 References
 ----------
@@ -136,7 +136,7 @@ class State(NamedTuple):
 
 
 def initial(params: Params, scene: Scene) -> State:
-    """Everybody plans to go on as he does."""
+    """Every train plans to go on as it does."""
     n, N = len(scene.trains), params.horizon
     v = scene.own[scene.consists.first[:-1], SPEED]
     return State(v.copy(), np.zeros((n, N)), np.zeros((n, 4 * N), np.int64))
@@ -183,7 +183,7 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
     leader : ndarray, shape (4,)
         Position [m], speed [m/s], acceleration [m/s2], ... of the reference.
     links : Links
-        Who hears whom; only the nearest train ahead counts.
+        Who receives from whom; only the nearest train ahead counts.
     heard : ndarray, shape (L, 6 + N)
         The last message of each link, zeros where none has come yet.
     state : State

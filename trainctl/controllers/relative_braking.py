@@ -4,7 +4,7 @@ Symbols
 -------
 x, v     front position [m], speed [m/s]; _l: of the train ahead
 b        full braking [m/s2]; b_l: of the train ahead, which it sends
-t_r      reaction time [s]: nobody brakes before
+t_r      reaction time [s]: no train brakes before
 M        spacing that is left when both stand, front to front [m]: length of the train ahead and margin
 S        relative braking distance ``v t_r + v2 / (2 b) - v_l2 / (2 b_l)`` [m]
 w        maximum safe speed [m/s]
@@ -145,7 +145,7 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
     leader : ndarray, shape (4,)
         Position [m], speed [m/s], acceleration [m/s2], ... of the reference.
     links : Links
-        Who hears whom; only the nearest train ahead counts.
+        Who receives from whom; only the nearest train ahead counts.
     heard : ndarray, shape (L, 6)
         The last message of each link, zeros where none has come yet.
 

@@ -8,8 +8,8 @@ Symbols
 p, v     position [m], speed [m/s]
 v0       reference speed [m/s], known to all trains
 h        feedback gain of the speed [1/s]
-a_ij     weight with which train i hears train j [1/s2]
-d_ij     wanted p_i - p_j [m]; a link carries the wanted p_sender - p_receiver, which is -d_ij
+a_ij     weight with which train i receives from train j [1/s2]
+d_ij     desired p_i - p_j [m]; a link carries the desired p_sender - p_receiver, which is -d_ij
 T        control period [s]
 u_c      demanded acceleration [m/s2]; the input is u_c plus the running resistance u_r, which the plant adds
 theta_1  maximum speed [m/s]; theta_2 minimum and maximum input [m/s2]

@@ -39,7 +39,7 @@ W1, W2, W3, RESISTANCE, MEASUREMENT = range(5)
 
 
 def laplacian(n: int, links: Links) -> Floats:
-    """L of the weighted directed graph, shape (n, n) [1/s2]: train i hears j with weight -L[i, j]."""
+    """L of the weighted directed graph, shape (n, n) [1/s2]: train i receives from j with weight -L[i, j]."""
     out = np.zeros((n, n))
     np.add.at(out, (links.receiver, links.sender), -links.weight)
     np.add.at(out, (links.receiver, links.receiver), links.weight)
@@ -70,7 +70,7 @@ def reference_speed(scene: Scene) -> float:
 
 
 def graph(n: int, links: Links) -> coo_array:
-    """Who hears whom as a sparse matrix, sender to receiver."""
+    """Who receives from whom as a sparse matrix, sender to receiver."""
     return coo_array((np.ones(len(links.sender)), (links.sender, links.receiver)), shape=(n, n))
 
 

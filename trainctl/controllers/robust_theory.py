@@ -5,7 +5,7 @@ As printed, with one correction; in the paper's own example its assumptions have
 Symbols
 -------
 psi              all phat_i and phat_i + c_i vbar_i (position and speed errors in the moving formation)
-q_i, xi_a        weights a train hears with, summed; minimum weight of all [1/s2]
+q_i, xi_a        weights of what a train receives, summed; minimum weight of all [1/s2]
 h, T             feedback gain [1/s], period [s]
 W1, W2, W3       maximum |w1| [m], |w2| [m/s], |w3| [m/s2]
 b1lo, B1         minimum and maximum magnitude a saturated speed error can have [m/s]

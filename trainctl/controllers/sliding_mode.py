@@ -18,7 +18,7 @@ late. On S = 0 the spacing error decays with c, and ``S' = -k sat(S / phi)`` is 
 
     u = a_l + c (v_l - v) + k sat(S / phi) - z2
 
-makes of it ([1]_, section IV, without its terms of the first train of the string: here nobody hears that but its follower). The
+makes of it ([1]_, section IV, without its terms of the first train of the string: here only its follower receives that). The
 observer is the linear one of [2]_ with both poles at -omega, over one period:
 
     z1+ = z1 + T (z2 + u + 2 omega (v - z1)),    z2+ = z2 + T omega2 (v - z1),
@@ -29,9 +29,9 @@ Departures
 ----------
 * [1]_ has a sign function in a boundary layer as well, but no observer; the constant spacing it keeps with the first train's
   speed is string stable, and without that it is only as far as a_l comes in time: with a control period of T errors may grow by
-  about a_l's delay. ``trainctl compare spacing`` tells by how much.
+  about a_l's delay. ``trainctl compare spacing`` shows by how much.
 * a_l is the mean acceleration of the control period before, as the train ahead measures it.
-* Old messages are carried forward, see ``ahead``. Who follows nobody takes the speed of the reference.
+* Old messages are carried forward, see ``ahead``. A train that follows none takes the speed of the reference.
 
 References
 ----------
@@ -139,7 +139,7 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
     leader : ndarray, shape (4,)
         Position [m], speed [m/s], acceleration [m/s2], ... of the reference.
     links : Links
-        Who hears whom; only the nearest train ahead counts.
+        Who receives from whom; only the nearest train ahead counts.
     heard : ndarray, shape (L, 6)
         The last message of each link, zeros where none has come yet.
     state : State

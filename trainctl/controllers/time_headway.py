@@ -29,7 +29,7 @@ Departures
   spacing.
 * a_l is the mean acceleration of the control period before, as the train ahead measures it: what it asks for may not be what it
   gets.
-* Old messages are carried forward, see ``ahead``. Who follows nobody takes the speed of the reference, and nobody runs faster than
+* Old messages are carried forward, see ``ahead``. One that follows none takes the speed of the reference, and none runs faster than
   ``faster_mps`` above that to close up.
 
 References
@@ -109,7 +109,7 @@ class State(NamedTuple):
 
 
 def initial(params: Params, scene: Scene) -> State:
-    """Nobody has accelerated yet."""
+    """No train has accelerated yet."""
     return State(scene.own[scene.consists.first[:-1], SPEED].copy())
 
 
@@ -152,7 +152,7 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
     leader : ndarray, shape (4,)
         Position [m], speed [m/s], acceleration [m/s2], ... of the reference.
     links : Links
-        Who hears whom; only the nearest train ahead counts.
+        Who receives from whom; only the nearest train ahead counts.
     heard : ndarray, shape (L, 6)
         The last message of each link, zeros where none has come yet.
     state : State

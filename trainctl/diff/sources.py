@@ -27,7 +27,7 @@ def our_table(run: Run, table: str) -> Log:
         for path in run.files(table):
             names = parquet_names(path)
             if len(set(names)) < len(names):
-                raise InputError(f"{path}: a column stands more than once")
+                raise InputError(f"{path}: a column appears more than once")
             for batch in (rows.rename_columns(names) for rows in parquet_rows(path)):
                 for name in (*([time] if time else []), *keys):
                     if name not in batch.column_names:

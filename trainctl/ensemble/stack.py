@@ -174,7 +174,7 @@ def _ordered(p: Model, here: Ways) -> list[tuple[str, ...]]:
         p.supervision, p.assumed, speed, np.zeros(len(routes)), p.scenario.run.step_s, p.step_theta
     )  # fmt: skip
     orders = Orders(p, _Unheard())
-    _, given = orders.step(0.0, seen, here, speed, stops_in, nobody, orders.initial())
+    _, given = orders.step(0.0, seen, here, speed, lambda: stops_in, nobody, orders.initial())
     for i, edges in given:
         routes[i] = edges
     return routes

@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from trainctl.errors import InputError
-from trainctl.figures import style, train_graph, trains, units
+from trainctl.figures import platforms, style, train_graph, trains, units
 from trainctl.figures.trains import Drawn, comparison, drawable
 from trainctl.laws import shipped
 from trainctl.runs.run import Run
@@ -34,6 +34,7 @@ FORMATS = ("png", "svg", "pdf")
 #: Every figure: name -> function of a drawable run.
 FIGURES: dict[str, Callable[[Drawn], Figure]] = {
     "train_graph": train_graph.train_graph,
+    "platforms": platforms.platforms,
     "positions": trains.positions,
     "spacing": trains.spacings,
     "spacing_errors": trains.spacing_errors,
@@ -54,7 +55,7 @@ FIGURES: dict[str, Callable[[Drawn], Figure]] = {
     "acceleration_estimates": units.estimates("acceleration", "acceleration [m/s²]"),
 }
 
-GENERIC = ("train_graph", "positions", "spacing", "spacing_errors", "speeds", "inputs")
+GENERIC = ("train_graph", "platforms", "positions", "spacing", "spacing_errors", "speeds", "inputs")
 OF_UNITS = ("couplers", "coupler_forces", "unit_forces")
 
 
@@ -88,6 +89,8 @@ def _has(drawn: Drawn, name: str) -> bool:
     """Whether the log has what a figure shows."""
     if not drawn.trains.names:
         return False
+    if name == "platforms":
+        return len(drawn.run.stops) > 0 and bool(drawn.run.stops["arrival_s"].notna().any())
     if name in ("spacing", "spacing_errors"):
         return bool(drawn.links.names)
     if name == "gaps":

@@ -1,8 +1,8 @@
 """Distance axes of train graphs: which trains share a corridor, how far along it they are, and what lies there by name.
 
 On a net of any shape a position alone does not say on which branch a train is. A corridor is the way of one train over the net;
-other trains are on it where they run on its edges, on the same track in the other direction, or on a track beside it that
-leaves it and comes back.
+other trains are on it where they run on its edges, on the same track in the other direction, on a track that leaves it and comes
+back, or on one that lies beside it in the plane, as the other track of a double line does.
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ import numpy as np
 import sumo_net
 from sumo_net import Line, LineError, Rails
 from sumo_net.netfile import read_net
+from sumo_net.shapes import shapes
+from trainctl.figures import beside
+from trainctl.figures.beside import BESIDE, Scale
 from trainctl.runs.run import Run
 from trainctl.runs.series import INSTANT, Series
 from trainctl.signals import Floats
 
 #: Corridors drawn at most.
 MOST = 4
-#: Tracks that leave a corridor and come back lie beside it if they are at most so many times as long or as short as what they pass.
-BESIDE = 2.0
 #: A stop that no train reached is drawn if it lies so near the stretch trains covered, as a share of it; else it is just named.
 NEAR = 0.5
 #: Junctions and crossovers named at most; beyond, only those where trains of the run part, meet or cross over.
@@ -36,13 +37,6 @@ class Place(NamedTuple):
     at_m: float
     name: str
     kind: str  # "stop", "unreached" (a stop to which no train came), "junction" or "crossover"
-
-
-class Scale(NamedTuple):
-    """The distances of one edge: ``start_m`` at its beginning, and ``per_m`` for every metre of it; -1 in the other direction."""
-
-    start_m: float
-    per_m: float
 
 
 @dataclass(frozen=True)
@@ -59,10 +53,9 @@ def line_of(run: Run) -> Line | None:
     """The line of parallel tracks of a run if it can still be read, else None."""
     place = str(run.scenario.get("network", {}).get("line", "")) if (run.folder / "scenario.toml").exists() else ""
     known = sumo_net.shipped()
-    nets = sorted((run.folder / "sumo").glob("*.net.xml"))
     try:
-        if nets:
-            return Line.read(nets[0])
+        if run.net is not None:
+            return Line.read(run.net)
         return Line.of(sumo_net.read_spec(known.get(place, place))) if place else None
     except (LineError, OSError):
         return None
@@ -94,19 +87,21 @@ def corridors(run: Run, trains: Series) -> tuple[list[Corridor], str]:
     """
     edge = trains.frame["edge"].astype(str).to_numpy()
     position = trains.column("position_m")
-    nets = sorted((run.folder / "sumo").glob("*.net.xml"))
+    net = run.net
     try:
-        rails = Rails.read(nets[0], set(edge)) if nets else None
+        rails = None if net is None else Rails.read(net, set(edge))
+        pieces = () if net is None else shapes(net, set(edge))
     except (LineError, OSError):
-        rails = None
-    if rails is None or not set(edge) <= set(rails.edges):
+        rails, pieces = None, ()
+    if net is None or rails is None or not set(edge) <= set(rails.edges):
         return [Corridor("", {name: position[rows] for name, rows in trains.slices()}, ())], ""
+    points = {rails.index[piece.edge]: piece.points for piece in pieces if piece.edge in rails.index and len(piece.points) > 1}
     visits = {name: _visits(edge[rows], rails) for name, rows in trains.slices()}
     ways = sorted({tuple(w) for v in visits.values() for w in v}, key=lambda w: (-_length(w, rails), w))
     scales: dict[tuple[int, ...], dict[int, Scale]] = {}
     for way in ways:
         if not any(_covers(known, way, rails) for known in scales.values()):
-            scales[way] = _extended(_along(way, rails), ways, rails)
+            scales[way] = _extended(way, _along(way, rails), ways, rails, points)
     number = np.array([rails.index[e] for e in edge])
     found = []
     for way, known in scales.items():
@@ -123,7 +118,7 @@ def corridors(run: Run, trains: Series) -> tuple[list[Corridor], str]:
         beyond = tuple(place.name for place in named if not covered.min() - spare <= place.at_m <= covered.max() + spare)
         named = [place for place in named if place.name not in beyond]
         ends = _ends(way, rails, [place for place in named if place.kind == "stop"], covered)
-        places = tuple(sorted([*named, *_junctions(nets[0], way, known, ways, rails)]))
+        places = tuple(sorted([*named, *_junctions(net, way, known, ways, rails)]))
         found.append(Corridor(ends, distance, places, beyond))
     found.sort(key=lambda c: -len(c.distance))
     shown = {name for corridor in found[:MOST] for name in corridor.distance}
@@ -163,8 +158,10 @@ def _along(way: tuple[int, ...], rails: Rails) -> dict[int, Scale]:
     return found
 
 
-def _extended(known: dict[int, Scale], ways: list[tuple[int, ...]], rails: Rails) -> dict[int, Scale]:
-    """The same with tracks beside the corridor: stretches of other ways that leave it and come back."""
+def _extended(
+    corridor: tuple[int, ...], known: dict[int, Scale], ways: list[tuple[int, ...]], rails: Rails, points: dict[int, Floats]
+) -> dict[int, Scale]:
+    """The same with tracks beside the corridor: stretches of other ways that leave it and come back, or lie there in the plane."""
     found: dict[int, Scale] = dict(known)
     for way in ways:
         on = [k for k, e in enumerate(way) if e in known]
@@ -180,6 +177,9 @@ def _extended(known: dict[int, Scale], ways: list[tuple[int, ...]], rails: Rails
             for e in between:
                 found.setdefault(e, Scale(begin, passed / length))
                 begin += passed / length * float(rails.length_m[e])
+    places = beside.Corridor(corridor, known, points, rails)
+    for way in ways:
+        found = beside.along(way, found, places, rails) | found
     return found
 
 

@@ -152,11 +152,10 @@ def along(distance: Floats) -> Floats:
 def travelled(drawn: Drawn, braking: dict[str, Floats], length: dict[str, float]) -> dict[str, Travelled]:
     """What every train ran over; empty where the run's net cannot be read or has no signals."""
     edges, position = drawn.trains.frame["edge"].astype(str).to_numpy(), drawn.trains.column("position_m")
-    nets = sorted((drawn.run.folder / "sumo").glob("*.net.xml"))
-    if not nets:
+    if drawn.run.net is None:
         return {}
     try:
-        rails, net = Rails.read(nets[0], set(edges)), read_net(nets[0])
+        rails, net = Rails.read(drawn.run.net, set(edges)), read_net(drawn.run.net)
     except LineError:
         return {}
     signals = {j.attributes.get("id") for j in net.junctions if j.attributes.get("type") == "rail_signal"}

@@ -1,4 +1,4 @@
-"""Metrics of who is late: at the entry, at stops, at the end of the way."""
+"""Metrics of delays: at the entry, at stops, at the end of the route."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
     "punctuality.stop_within_60_s_share": (
         "1", "Share of planned stops whose delay is at most 60 s; one that was not made in time counts as late."),
     "punctuality.stop_within_180_s_share": ("1", "The same for 180 s."),
-    "punctuality.stops_overdue": ("1", "Planned stops of which no delay is known though their time was over when the run ended."),
+    "punctuality.stops_overdue": ("1", "Planned stops without a known delay although their time had passed when the run ended."),
     "punctuality.end_delay_mean_s": ("s", "Mean over the trains of the delay at the last planned stop they made (item: a train)."),
     "punctuality.end_delay_p95_s": ("s", "95th percentile of these delays."),
     "punctuality.end_delay_max_s": ("s", "Maximum of these delays."),

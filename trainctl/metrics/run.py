@@ -39,7 +39,7 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
     "bounds.coupler_upper_margin_m": ("m", "Minimum upper bound minus coupler displacement, over all sub-steps."),
     "bounds.broken": ("1", f"Number of kinds of bound (the eight margins above) violated by more than {SLACK:g} of their unit."),
     "bounds.first_violation_s": ("s", "Time of the first recorded instant at which a bound is violated; absent if none is."),
-    "bounds.first_violation_who": ("text", "Which bound of whom is violated at that instant."),
+    "bounds.first_violation_who": ("text", "Which bound of which train, link or unit is violated at that instant."),
     "formation.settling_s": (
         "s", "Time of the run from which every link that there is stays within the band (default 1 m) of its desired spacing; "
         "None: not by the last link."),
@@ -48,12 +48,12 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
         "s", "The same within each window between changes of topology (item: its start), counted from its start; "
         "None: not before its end."),
     "formation.final_error_m": ("m", "Largest distance of a link from its desired spacing at the last instant."),
-    "formation.overshoot_m": ("m", "Largest error of a link on the other side than at the start of its window."),
+    "formation.overshoot_m": ("m", "Largest error of a link with the opposite sign to that at the start of its window."),
     "formation.speed_settling_s": (
         "s", "Time after which every train stays within the band (default 2 %) of a constant reference speed, from the start of "
         "that speed (item) on; None: not before its end."),
     "formation.speed_overshoot_mps": (
-        "m/s", "Largest speed error on the other side than at the start of a constant reference speed."),
+        "m/s", "Largest speed error with the opposite sign to that at the start of a constant reference speed."),
     "formation.final_speed_error_mps": ("m/s", "Largest distance of a train's speed from the reference at the last instant."),
     "string.l2_gain": (
         "1", "Norm over time of a link's spacing error over that of the link ahead of it (neighbours, common instants); "

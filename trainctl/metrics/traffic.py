@@ -43,7 +43,10 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
     "traffic.speed_max_mps": ("m/s", "Maximum speed."),
     "traffic.section_m": ("m", "Kilometrage at which passages are counted."),
     "traffic.passages": ("1", "Trains whose front passed the section."),
-    "traffic.trains_per_hour": ("1/h", "Passages less one over the time from the first to the last of them; per track as items."),
+    "traffic.trains_per_hour": (
+        "1/h",
+        "Passages minus one, divided by the time from the first to the last of them; per track as items.",
+    ),
     "traffic.passage_headway_min_s": ("s", "Minimum time between two fronts at the section on one track."),
     "traffic.sumo_trips": ("1", "Trips that SUMO saw arrive (tripinfo)."),
     TRIPINFO["duration"]: ("s", "Mean journey time of these trips."),
@@ -162,7 +165,7 @@ def metrics_of_fcd(path: Path | str) -> Values:
     Parameters
     ----------
     path : Path
-        The log. Its kind is told from its content, not from its name.
+        The log. Its kind follows from its content, not from its name.
 
     Raises
     ------
@@ -235,7 +238,7 @@ def _once(path: Path, time: Floats, ids: pa.ChunkedArray) -> None:
     if len(again):
         k, who = divmod(int(key[again[0]]), len(coded.dictionary))
         at = time[int(np.searchsorted(instant, k))]
-        raise InputError(f"{path}: vehicle {coded.dictionary[who].as_py()} stands twice at {at:.10g} s")
+        raise InputError(f"{path}: vehicle {coded.dictionary[who].as_py()} appears twice at {at:.10g} s")
 
 
 def _on_lane(batch: pa.Table, parked: Mapping[str, Sequence[tuple[float, float]]]) -> pa.Table:

@@ -1,4 +1,4 @@
-"""What must hold is watched while a run goes on: the first time anything breaks becomes an event; the metrics count afterwards.
+"""What must hold is watched while a run goes on: the first violation of anything becomes an event; the metrics count afterwards.
 
 Watched: speed and input bounds, link spacings, the constrained quantities of continuous laws, couplers, trains inside one another,
 the line's speed limits, connected formations, and the balance of energies; and who waits for whom. That SUMO moved every train just

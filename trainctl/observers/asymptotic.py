@@ -201,7 +201,7 @@ def violations(params: Params, scene: Scene) -> list[str]:
         if twice.any():
             u = int(np.argmax(twice))
             found.append(
-                f"observer.fault_sinusoids[{k + 1}] = [{omega[u, k]:g}, {gain[u]:g}]: unobservable, this omega stands twice"
+                f"observer.fault_sinusoids[{k + 1}] = [{omega[u, k]:g}, {gain[u]:g}]: unobservable, this omega appears twice"
             )
     fastest = float(np.min(params.pole_per_s))
     stiff = (3 + 2 * len(params.fault_sinusoids)) * -fastest * scene.sub_step

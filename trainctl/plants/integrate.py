@@ -243,7 +243,7 @@ def copy(out, table):  # type: ignore[no-untyped-def]
 
 @bare(inline="always")
 def talking(air):  # type: ignore[no-untyped-def]
-    """Whether trains hear each other within a stretch of integration."""
+    """Whether trains receive from each other within a stretch of integration."""
     return air.live and air.heard.shape[1] > 0
 
 

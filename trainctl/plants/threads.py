@@ -43,14 +43,14 @@ def cores() -> int:
 
 
 def shares(first: Ints, links: Links, talk: bool, threads: int) -> Shares:
-    """Cut trains into blocks, between trains that do not hear each other, and share these out by the units they have.
+    """Cut trains into blocks, between trains that receive nothing from each other, and share these out by the units they have.
 
     Parameters
     ----------
     first : ndarray, shape (n + 1,)
         Units of train ``i``: ``first[i]:first[i + 1]``.
     links : Links
-        Who hears whom.
+        Who receives from whom.
     talk : bool
         Whether they do within a stretch of integration; else trains may be cut anywhere.
     threads : int

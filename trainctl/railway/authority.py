@@ -177,7 +177,7 @@ def judge(
 
 
 def measured(targets: Targets, limits: Limits, error: Floats) -> tuple[Targets, Limits]:
-    """What trains are told whose positions are measured with an ``error`` (n,), measured minus true position [m]."""
+    """What trains know whose positions are measured with an ``error`` (n,), measured minus true position [m]."""
     if not error.any():
         return targets, limits
     other = np.where(targets.other >= 0, error[targets.other], 0.0)

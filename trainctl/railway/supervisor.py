@@ -77,18 +77,21 @@ class Params(Table):
         "off", description="on: bounds every train's acceleration; monitor: reports what it would have done, without doing it."
     )
     curve: Literal["relative", "absolute"] = Field(
-        "relative", description="A train ahead is taken to need its braking distance itself, or to stand where its rear is now."
+        "relative",
+        description="relative: the train ahead needs its own braking distance; absolute: it may stop dead where its rear is now.",
     )
     emergency_mps2: float = Field(
         1.0,
         gt=0.0,
-        description="Full braking [m/s2]: every train can give it on the level at any speed, and none is let exceed it. What is"
+        description="Full braking [m/s2]: every train can give it on the level at any speed, and none may exceed it. What is"
         " relied on is less by slopes, faults and disturbances: see `trainctl check`.",
     )
     service_mps2: float = Field(
         0.7, gt=0.0, description="Deceleration [m/s2] planned with before lower speed limits and stops; at most emergency_mps2."
     )
-    margin_m: float = Field(20.0, ge=0.0, description="Kept between a front and what it must not reach [m]; stops and signals are.")
+    margin_m: float = Field(
+        20.0, ge=0.0, description="Distance kept between a front and what it must not reach [m]; stops and signals may be reached."
+    )
     greatest_mps2: float = Field(1.0, gt=0.0, description="Maximum acceleration admitted [m/s2].")
     emergency_distance_m: float = Field(
         0.0, ge=0.0, description="Gap to another train [m] below which emergency braking is ordered whatever the speeds."

@@ -170,7 +170,7 @@ class Tape:
         return self.world.ways
 
     def linked(self, links: Links, formation: Ints) -> None:
-        """Who hears whom from now on."""
+        """Who receives from whom from now on."""
         self.world.linked(links, formation)
 
     def move(self, displacement: Floats, step: float) -> None:
@@ -353,7 +353,7 @@ def restore(loop: Loop, tape: Tape, saved: Saved) -> None:
     tape.replay(loop.p.scenario.run.step_s)
     seen = loop.world.measure()
     if not (np.array_equal(seen.position, saved.arrays["seen.0"]) and np.array_equal(seen.edge, saved.arrays["seen.1"])):
-        raise SimulatorError("the simulator did not come back to where it was: other versions or another network")
+        raise SimulatorError("the simulator did not return to its state at the checkpoint: other versions or another network")
     values = saved.values["state"]
     going = again(f"state.{loop.state._fields.index('traffic')}", loop.state.traffic, saved.arrays, values)
     if going.leg.any():

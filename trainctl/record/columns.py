@@ -44,7 +44,7 @@ class Call(NamedTuple):
 
 #: stops.parquet, one row per train and stop: value, unit and meaning; ``train``, ``stop`` and ``platform`` come before them.
 STOPS: dict[str, tuple[Callable[[Call], float], str, str]] = {
-    "number": (lambda call: call.number, "1", "Number of the stop on the train's way, from 1."),
+    "number": (lambda call: call.number, "1", "Number of the stop on the train's route, from 1."),
     "planned_arrival_s": (lambda call: call.stop.planned, "s", "SUMO's `arrival`; missing: none is planned."),
     "arrival_s": (lambda call: call.arrival, "s", "When the train stood, or passed a waypoint; missing: it did not come."),
     "planned_departure_s": (

@@ -46,7 +46,7 @@ def verify(path: Path, expected: Sum, beginning: bool = False) -> None:
         It is not.
     """
     if sum_of(path, expected[0] if beginning else None) != list(expected):
-        raise InputError(f"{path}: damaged or changed: not what the run goes on from")
+        raise InputError(f"{path}: damaged, or changed since the checkpoint was written")
 
 
 def sealed(content: Any) -> bytes:

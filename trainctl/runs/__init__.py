@@ -1,4 +1,4 @@
-"""Reading what runs leave behind: logs of SUMO's in any format, and (``trainctl.record``) our own run folders.
+"""Reading what runs write: logs of SUMO's in any format, and (``trainctl.record``) our own run folders.
 
 One reader serves ``trainctl diff`` and ``trainctl metrics``: ``logs.sumo_log(path)`` says what a file is, ``Log.batches()``
 streams it.

@@ -55,7 +55,7 @@ def sumo_log(path: Path) -> Log | None:
     found = kind_of_table(logged)
     if found is None:
         if len(set(logged)) < len(logged):
-            told = "a column stands more than once: not a log of SUMO, or one with plain headers"
+            told = "a column appears more than once: not a log of SUMO, or one with plain headers"
             raise InputError(f"{path}: {told} (then: sumo --output.column-header tag)")
         return None
     kind, called = found

@@ -19,7 +19,7 @@ class Line(NamedTuple):
 
 
 def summary(run: Run) -> list[Line]:
-    """What a finished run tells beside its results: collisions, overspeeds, waits, bounds; the last line is that of the bounds."""
+    """What a run reports beside its results: collisions, overspeeds, waits, bounds; the last line is that of the bounds."""
     return [*_happened(run), Line("bounds", bounds(run.info), False)]
 
 

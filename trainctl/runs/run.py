@@ -98,6 +98,11 @@ class Run:
         """One row per train and stop; empty if no train stops."""
         return self.table("stops", missing_is_empty=True)
 
+    @property
+    def net(self) -> Path | None:
+        """The SUMO net it ran on: SUMO's copy, or that of a run without SUMO on a given net; None: a line of ours."""
+        return next(iter(sorted([*(self.folder / "sumo").glob("*.net.xml"), *self.folder.glob("*.net.xml")])), None)
+
     @cached_property
     def events(self) -> list[dict[str, Any]]:
         """The lines of events.jsonl. A last line cut short by a kill is left out."""

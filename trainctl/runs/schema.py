@@ -44,7 +44,7 @@ def check_table(name: str, table: pa.Table, place: Path) -> None:
         return
     columns, wrong = table.column_names, []
     if len(set(columns)) < len(columns):
-        raise InputError(f"{place}: {name}: a column stands more than once")
+        raise InputError(f"{place}: {name}: a column appears more than once")
     for column in ("time_s", *KEYS[name], *NEEDED[name]):
         if column not in columns:
             wrong.append(f"{place}: {name}: has no column {column}")

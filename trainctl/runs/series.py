@@ -97,9 +97,9 @@ class Pairs(Series):
 
 
 def pairs(links: pd.DataFrame) -> Pairs:
-    """Links as one series per pair ``ahead-behind``, whoever hears whom.
+    """Links as one series per pair ``ahead-behind``, whichever receives from which.
 
-    A pair that hears each other stands twice in the log with opposite signs; here the train that is to be ahead comes first
+    A pair that receives from each other stands twice in the log with opposite signs; here the train that is to be ahead comes first
     and the tighter bound of both rows counts. Columns: ``time_s, spacing_m, desired_m, lower_m, upper_m, error_m`` and
     ``age_s``, the time since the link was made or its desired spacing or bounds were changed.
     """

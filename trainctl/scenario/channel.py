@@ -30,11 +30,11 @@ class Channel(Table):
     delay_shape: Literal["uniform", "exponential"] = Field("uniform", description="How the random delay is distributed.")
     send_beyond_m: Positive | None = Field(
         None,
-        description="A train sends only once its place relative to the reference is off by more than this from what it sent last"
+        description="A train sends only once its position relative to the reference is off by more than this from what it sent last"
         " [m]; default: in every exchange.",
     )
     send_every_s: Positive | None = Field(
-        None, description="With send_beyond_m: it sends at least so often [s]; default never for this reason."
+        None, description="With send_beyond_m: it sends at least this often [s]; default: no such limit."
     )
 
     @model_validator(mode="after")

@@ -12,6 +12,22 @@ from trainctl.scenario import limits, promise
 from trainctl.scenario.model import Model
 from trainctl.topology import graph
 
+#: What the facts are called in the table for people.
+WORDS = {
+    "links_at_start": "links at the start",
+    "steps": "steps of the run",
+    "step_s": "step",
+    "control_period_s": "control period",
+    "lead_theta": "lead of the plant, theta",
+    "smallest_control_period_s": "minimum control period",
+    "input_room_mps2": "input every train can give",
+    "sub_step_s": "integration step",
+    "cooperate": "trains that cooperate",
+}
+
+#: Units of facts that are numbers, by the ends of their names.
+UNITS = {"_s": "s", "_mps2": "m/s2"}
+
 #: More trains than this are counted, not named.
 MOST = 40
 
@@ -58,6 +74,18 @@ def facts(p: Model) -> dict[str, Any]:
     if hasattr(p.law, "analysis"):
         found["analysis"] = p.law.analysis(p.params, scene, p.scenario.disturbance).as_dict()
     return found
+
+
+def in_words(found: dict[str, Any]) -> list[tuple[str, str]]:
+    """Name and value of every fact that is no list of lines, for people."""
+    rows = []
+    for key, value in found.items():
+        if key not in ("warnings", "report", "analysis", "protection", "promise"):
+            unit = next((f" {unit}" for end, unit in UNITS.items() if key.endswith(end)), "")
+            numbers = value if isinstance(value, list) else [value] if isinstance(value, float) else []
+            shown = " .. ".join(f"{v:.6g}" for v in numbers) or str(value)
+            rows.append((WORDS.get(key, key), f"{shown}{unit}"))
+    return rows
 
 
 def _traffic(p: Model) -> dict[str, Any]:

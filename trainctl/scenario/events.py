@@ -18,16 +18,18 @@ class Event(Table):
         description="reroute: the train takes a crossover to another track and stays there. brake: it brakes on its own. outage: "
         "its radio neither sends nor receives."
     )
-    train: Id = Field(description="The train; an outage may be of all.")
+    train: Id = Field(description="The train; for an outage also all.")
     crossover: str | None = Field(
         None, description="Id of the crossover (see `trainctl net show`); default: the next one to to_track."
     )
     to_track: Id | None = Field(None, description="Track to change to, if no crossover is named.")
     to_edge: str | None = Field(
-        None, description="Edge of the net to go to by the shortest way, from where the train goes on to its old goal if it can."
+        None,
+        description="Edge of the net to go to by the shortest path; from there the train goes on to its former destination"
+        " if it can.",
     )
     deceleration_mps2: Positive | None = Field(
-        None, description="brake: so hard, as far as its plant can [m/s2]; default full braking, [supervisor] emergency_mps2."
+        None, description="brake: deceleration, as far as its plant can [m/s2]; default full braking, [supervisor] emergency_mps2."
     )
     until_s: Positive | None = Field(
         None, description="brake: from then on its law drives it again [s], default never; outage: when it is over [s]."
@@ -71,5 +73,5 @@ class Order(Table):
     def _once(cls, trains: tuple[Id, ...]) -> tuple[Id, ...]:
         twice = sorted(i for i, count in Counter(trains).items() if count > 1)
         if twice:
-            raise ValueError(f"{', '.join(twice)} stands more than once")
+            raise ValueError(f"{', '.join(twice)} appears more than once")
         return trains

@@ -18,7 +18,7 @@ def can_brake(p: Model) -> list[str]:
     if not len(short):
         return []
     i = int(short[np.argmin(p.sure_braking[short])])
-    minimum, among = p.sure_braking[i], f" (and {len(short) - 1} other trains too little)" if len(short) > 1 else ""
+    minimum, among = p.sure_braking[i], f" (and {len(short) - 1} other trains brake too weakly, too)" if len(short) > 1 else ""
     return [
         f"supervisor.emergency_mps2 = {rules.emergency_mps2:g}: train {p.scenario.ids[i]} can brake with {minimum:.6g} m/s2 at"
         f" most{among}"

@@ -44,7 +44,7 @@ def chosen(
     if driving.signals == "ignore":
         wrong = (
             'traffic.signals = ignore: not with others = "sumo": SUMO\'s trains obey them and ours would not, so that two'
-            " authorities could hold each other up for ever"
+            " authorities could block each other for ever"
         )
         return "ignore", [], [wrong] if sumo else []
     if driving.signals is None and not sumo and (not signals or not alone):
@@ -123,7 +123,7 @@ def constraints(
         here = rails.index[order.edge]
         edges = {order.edge, *([rails.edges[int(rails.twin[here])]] if rails.twin[here] >= 0 else [])}
         before = {i: _before(routes[i], edges, rails, at) for i in order.trains}
-        wrong += [f"order[{k}].trains: {i}: no rail signal on its way before edge {order.edge} could keep the order"
+        wrong += [f"order[{k}].trains: {i}: no rail signal on its route before edge {order.edge} could keep the order"
                   for i, name in before.items() if name is None]  # fmt: skip
         for a, b in pairwise(order.trains):
             if (foe := before[a]) and (own := before[b]):

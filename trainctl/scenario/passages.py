@@ -36,7 +36,7 @@ def mistakes(orders: Sequence[Order], routes: Mapping[str, Sequence[str]], twin:
                 if (edge, b, a) in first:
                     found.append(f"{said}: order[{other}] has {b} before {a}, and they cannot change places between the two")
                 if edge == routes[a][0] == routes[b][0] and number[b] < number[a]:
-                    found.append(f"{said}: {b} enters first, over edge {edge}, and they cannot change places on the way")
+                    found.append(f"{said}: {b} enters first, over edge {edge}, and they cannot change places on their routes")
     return list(dict.fromkeys(found))
 
 

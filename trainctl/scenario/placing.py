@@ -154,7 +154,7 @@ def on_the_line(scenario: Scenario, line: Line) -> list[str]:
             if t.position_m - length < line.begin_m:
                 tail = t.position_m - length
                 found.append(
-                    f"{here}.position_m = {t.position_m:.10g}: its tail at {tail:.10g} m is off the line, which begins at"
+                    f"{here}.position_m = {t.position_m:.10g}: its rear at {tail:.10g} m is off the line, which begins at"
                     f" {line.begin_m:.10g} m"
                 )
             placed.append((t.track, t.position_m, length, t.id))

@@ -1,4 +1,4 @@
-"""Scenario files: finding, reading, laying one over another, and the words in which a mistake is told.
+"""Scenario files: finding, reading, merging, and the words in which a mistake is reported.
 
 A mistake is one line, ``file: key = value: rule``; all mistakes of a file come at once. Rules that need more than the file
 (the line, the law's start conditions) live in ``trainctl.scenario.build``.
@@ -95,7 +95,7 @@ def _read(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
     except InputError as error:
         raise InputError([f"{path.name}: extends = {m}" for m in error.mistakes]) from None
     if under.resolve() in above:
-        raise InputError(f"{path.name}: extends = {base}: comes back to itself")
+        raise InputError(f"{path.name}: extends = {base}: leads back to itself")
     return _over(_found_from(_read(under, (*above, path.resolve())), under.parent, path.parent), data)
 
 

@@ -276,9 +276,11 @@ class Profile(Table):
     deceleration_mps2: float | None = Field(None, gt=0.0, description="follow_line: braking, positive [m/s2], default 0.5")
     below_limit_mps: float | None = Field(None, ge=0.0, description="follow_line: stay this far below the limits [m/s], default 0")
     margin_m: float | None = Field(
-        None, ge=0.0, description="follow_line: take the formation for longer by this, at both ends [m], default 0"
+        None, ge=0.0, description="follow_line: treat the formation as this much longer at both ends [m], default 0"
     )
-    stop_m: float | None = Field(None, description="follow_line: where the first train's slot comes to a stand [m], default never")
+    stop_m: float | None = Field(
+        None, description="follow_line: where the first train's slot comes to a standstill [m], default never"
+    )
 
     @model_validator(mode="after")
     def _one_form_in_order(self) -> Self:

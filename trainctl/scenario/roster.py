@@ -384,7 +384,9 @@ def _changes(scenario: Scenario, traffic: Configuration) -> tuple[str, ...]:
     if block != "files":
         found.append(f"option railsignal-moving-block: controller.block = {block} instead")
     if traffic.drawn:
-        found.append(f"flows {', '.join(traffic.drawn[:8])}: SUMO draws their trains itself, so none of them is planned for a time")
+        found.append(
+            f"flows {', '.join(traffic.drawn[:8])}: SUMO draws the departures itself, so these trains have no planned time"
+        )
     return (*found, "options time-to-teleport and collision.action: trains are never teleported, none is removed that collides")
 
 

@@ -137,7 +137,7 @@ class BoundsTable(Table):
 
 
 class Topology(Table):
-    """[topology]: who hears whom, at which spacing."""
+    """[topology]: who receives from whom, at which spacing."""
 
     rule: Literal["same_track", "links"] = Field(
         "same_track", description="same_track: neighbours on one track receive from each other; links: just the [[link]] tables."
@@ -151,7 +151,7 @@ class Topology(Table):
     lower_m: float | None = Field(None, description="Minimum spacing of consecutive trains, front to front [m]; default none.")
     upper_m: Positive | None = Field(None, description="Maximum spacing of consecutive trains [m]; default none.")
     weight: float = Field(1.0, description="Weight of links that state none (laws with weighted graphs).")
-    first_slot_m: float = Field(0.0, description="Wanted position of the first train relative to the reference [m].")
+    first_slot_m: float = Field(0.0, description="Nominal position of the first train relative to the reference [m].")
     range_m: Positive | None = Field(None, description="Messages do not reach farther than this [m]; default unlimited.")
     loss: float = Field(0.0, ge=0, lt=1, description="Probability that a message is lost, independent, seeded.")
     delay_s: NotNegative = Field(0.0, description="Age of a message when it arrives [s], a multiple of the exchange period.")
@@ -357,7 +357,7 @@ class Scenario(Table):
         ids = [t.id for t in trains]
         twice = sorted(i for i, count in Counter(ids).items() if count > 1)
         if twice:
-            raise ValueError(f"id {', '.join(twice)} stands more than once")
+            raise ValueError(f"id {', '.join(twice)} appears more than once")
         return trains
 
     @cached_property

@@ -7,6 +7,7 @@ the scenario that leads nowhere (its switch lies behind the train) is a mistake 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,7 +62,7 @@ class Orders:
         return own[number - 1] if number <= len(own) else Event.model_validate(s.given[number - len(own) - 1])
 
     def step(
-        self, t: float, seen: Seen, ways: Ways, speed: Floats, stops_in: Floats, ahead: Ints, s: State
+        self, t: float, seen: Seen, ways: Ways, speed: Floats, stops_in: Callable[[], Floats], ahead: Ints, s: State
     ) -> tuple[State, list[tuple[int, tuple[str, ...]]]]:
         """Orders whose time, place or condition has come: trains and their new routes.
 
@@ -73,8 +74,10 @@ class Orders:
             Where every train is.
         ways : Ways
             Their ways now.
-        speed, stops_in, ahead : ndarray, shape (n,)
-            Speed [m/s], the way in which it surely stops [m], and the train ahead in the formation, -1 if none.
+        speed, ahead : ndarray, shape (n,)
+            Speed [m/s], and the train ahead in the formation, -1 if none.
+        stops_in : callable
+            Gives the way in which every train surely stops (n,) [m]; called only where a train is led elsewhere.
         s : State
             Orders to come.
 
@@ -93,7 +96,7 @@ class Orders:
             if event.kind != "reroute":
                 continue
             i = self.index[event.train]
-            lock = float(stops_in[i])
+            lock = float(stops_in()[i])
             try:
                 if any(i == other for other, _ in found):
                     raise Refused("it has just been given another route")
@@ -236,7 +239,7 @@ class Orders:
         onward = rails.path(target, int(way[-1]))
         new = [*way[: k - 1].tolist(), *path.tolist(), *([] if onward is None else onward[1:].tolist())]
         if why := promise.uncovered(self.p, i, new):
-            raise Refused(f"the way to edge {event.to_edge} has {why}")
+            raise Refused(f"the path to edge {event.to_edge} has {why}")
         common = next((n for n, (a, b) in enumerate(zip(new, way.tolist(), strict=False)) if a != b), min(len(new), len(way)))
         more = {"to_edge": event.to_edge, "from_edge": rails.edges[int(way[max(common - 1, 0)])], "goes_on": onward is not None}
         return tuple(rails.edges[e] for e in new), more

@@ -122,7 +122,7 @@ class Points:
         self.constants.slope[:] = slope
 
     def relinked(self, scene: Scene, constants: Any, state: State) -> State:
-        """Nothing here depends on who hears whom."""
+        """Nothing here depends on who receives from whom."""
         return state
 
     def turned(self, train: int, own: Floats, front: float, state: State) -> tuple[Floats, State]:
@@ -387,7 +387,7 @@ class Units:
         self, loop: integrate.Inner, references: References, air: integrate.Air, t: float, number: int, first_time: bool,
         own: Floats, links: Links, messages: Messages, state: State,
     ) -> tuple[Messages, integrate.Air]:  # fmt: skip
-        """Send and hear at ``t``. A link opens with a message that arrives.
+        """Send and receive at ``t``. A link opens with a message that arrives.
 
         On a new edge list nothing has been heard yet: the first messages are those of one common instant.
         """

@@ -5,7 +5,7 @@ As SUMO does with its own trains, with other random numbers.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -45,7 +45,7 @@ class Rerouters:
         return State(nowhere, nowhere.copy())
 
     def step(
-        self, t: float, seen: Seen, ways: Ways, speed: Floats, stops_in: Floats, s: State, busy: Collection[int] = ()
+        self, t: float, seen: Seen, ways: Ways, speed: Floats, stops_in: Callable[[], Floats], s: State, busy: Collection[int] = ()
     ) -> tuple[State, list[tuple[int, tuple[str, ...]]]]:
         """Trains on an edge with a rerouter that gives them another way now, with their new routes.
 
@@ -57,8 +57,10 @@ class Rerouters:
             Where every train is.
         ways : Ways
             Their ways now.
-        speed, stops_in : ndarray, shape (n,)
-            Speed [m/s], and the way in which it surely stops [m].
+        speed : ndarray, shape (n,)
+            Speed [m/s].
+        stops_in : callable
+            Gives the way in which every train surely stops (n,) [m]; called only where a train comes over a rerouter.
         s : State
             What was decided before.
         busy : collection of int
@@ -77,21 +79,22 @@ class Rerouters:
         refused, routes = np.where(now == s.refused, s.refused, -1), []
         asks = np.isin(now, self.draws) & (now != s.asked)
         for i in np.flatnonzero((now != refused) & np.isin(now, self.at) | asks).tolist():
-            drawn = self._drawn_way(t, i, seen, ways, float(stops_in[i])) if asks[i] and i not in busy else ()
-            edges = drawn or (() if i in busy else self._around(t, i, seen, ways, float(speed[i]), float(stops_in[i])))
+            lock = float(stops_in()[i])
+            drawn = self._drawn_way(t, i, seen, ways, lock) if asks[i] and i not in busy else ()
+            edges = drawn or (() if i in busy else self._around(t, i, seen, ways, float(speed[i]), lock))
             if edges is None:
                 refused[i] = now[i]
             elif edges:
                 routes.append((i, edges))
         return State(refused, now), routes
 
-    def _drawn_way(self, t: float, i: int, seen: Seen, ways: Ways, stops_in: float) -> tuple[str, ...]:
-        """The way that train ``i`` draws, which comes over a rerouter; () if it keeps its own."""
+    def _drawn_way(self, t: float, i: int, seen: Seen, ways: Ways, lock: float) -> tuple[str, ...]:
+        """The way that train ``i`` draws, which comes over a rerouter; () if it keeps its own. It stays on the next ``lock`` m."""
         rails, train, edge = self.p.rails, self.p.scenario.train[i], self.p.rails.edges[int(seen.edge[i])]
         first, row, end = int(ways.first[i]), int(seen.row[i]), int(ways.first[i + 1])
         passed = int((ways.edge[first:row] == seen.edge[i]).sum())
         way, begin = ways.edge[row:end].tolist(), ways.begin[row:end]
-        kept = max(int(np.searchsorted(begin, seen.position[i] + stops_in, side="right")), 1)  # cannot change any more
+        kept = max(int(np.searchsorted(begin, seen.position[i] + lock, side="right")), 1)  # cannot change any more
         for k, choice in enumerate(self.choices, len(self.closings)):
             if (
                 edge not in choice.at
@@ -116,7 +119,7 @@ class Rerouters:
                 new = onward if onward[:kept] == way[:kept] and not turns else None
             if new is None:
                 self.journal.event(
-                    t, "reroute_refused", train=train.id, reason=f"there is no way to edge {wanted[-1]} that it can still take",
+                    t, "reroute_refused", train=train.id, reason=f"there is no path to edge {wanted[-1]} that it can still take",
                     position_m=float(seen.position[i]),
                 )  # fmt: skip
                 return ()
@@ -126,8 +129,8 @@ class Rerouters:
             return tuple(rails.edges[e] for e in new)
         return ()
 
-    def _around(self, t: float, i: int, seen: Seen, ways: Ways, speed: float, stops_in: float) -> tuple[str, ...] | None:
-        """The way of train ``i`` round what is closed for it; () if nothing is, None if there is no way."""
+    def _around(self, t: float, i: int, seen: Seen, ways: Ways, speed: float, lock: float) -> tuple[str, ...] | None:
+        """The way of train ``i`` round what is closed; () if nothing is, None if there is none. It stays on the next ``lock`` m."""
         p, rails = self.p, self.p.rails
         train, edge = p.scenario.train[i], rails.edges[int(seen.edge[i])]
         closed = self._shut(t, i, edge)
@@ -135,7 +138,7 @@ class Rerouters:
         way, begin = ways.edge[row:end].tolist(), ways.begin[row:end]
         if closed.isdisjoint(way[1:]):
             return ()
-        kept = max(int(np.searchsorted(begin, seen.position[i] + stops_in, side="right")), 1)  # cannot change any more
+        kept = max(int(np.searchsorted(begin, seen.position[i] + lock, side="right")), 1)  # cannot change any more
         blocked = next(e for e in way[1:] if e in closed)
         new = None if blocked in way[:kept] else self._path(i, way, kept, closed)
         said: dict[str, Any] = {"closed": rails.edges[blocked], "from_edge": edge}

@@ -1,4 +1,4 @@
-"""Who hears whom from now on, and the law's constants for it; made anew only when a formation changed."""
+"""Who receives from whom from now on, and the law's constants for it; made anew only when a formation changed."""
 
 from __future__ import annotations
 

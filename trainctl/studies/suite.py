@@ -272,7 +272,7 @@ def compare(
     asked = {"runs": plan.runs, "spacing_m": plan.spacing_m, "stops": plan.stops._asdict()}
     note = out / "plan.json"
     if resume and note.is_file() and json.loads(note.read_text(encoding="utf-8")) != json.loads(json.dumps(asked)):
-        raise InputError(f"--resume: the suite in {out} asks something else: see its plan.json")
+        raise InputError(f"--resume: the suite in {out} has another plan: see its plan.json")
     out.mkdir(parents=True, exist_ok=True)
     write_json(note, asked)
     places = {(row, name): out / "cells" / row / name for row in rows for name in situations}

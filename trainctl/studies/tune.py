@@ -165,7 +165,7 @@ def prepared(plan: TunePlan) -> Model:
     said = ", ".join(f"{key} = {value:g}" for key, value in known.items())
     if not plan.gains:
         raise InputError(f"--gain: missing; the numbers of law {law} are {said}")
-    wrong = [f"--gain {g.name}: no number of law {law}; there are: {said}" for g in plan.gains if g.name not in known]
+    wrong = [f"--gain {g.name}: not a number of law {law}; there are: {said}" for g in plan.gains if g.name not in known]
     if wrong:
         raise InputError(wrong)
     if (why := alone(model)) is not None:

@@ -102,7 +102,7 @@ class Baseline(Session):
         found = super().messages()
         if trains := [name for name, vclass in self.others.items() if vclass in RAIL]:
             some = f"{', '.join(trains[:8])}{' ...' if len(trains) > 8 else ''}"
-            found.append((None, f"{len(trains)} trains that SUMO draws otherwise than duarouter are not recorded: {some}"))
+            found.append((None, f"{len(trains)} trains that SUMO draws differently from duarouter are not recorded: {some}"))
         return found
 
     def _read(self) -> None:

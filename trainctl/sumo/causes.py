@@ -28,9 +28,9 @@ def cause(api: Any, train: str, edge: str, way: Sequence[str]) -> str:
     if train in simulation.getStartingTeleportIDList() or train in simulation.getEndingTeleportIDList():
         return "a teleport"
     if train in simulation.getArrivedIDList():
-        return f"SUMO let it arrive before the end of its way, on edge {edge}"
+        return f"SUMO let it arrive before the end of its route, on edge {edge}"
     if train not in vehicle.getIDList():
-        return "SUMO took it off the net: a collision, or somebody removed it"
+        return "SUMO took it off the net: a collision, or another program removed it"
     here, route = vehicle.getRoadID(train), list(vehicle.getRoute(train))
     if not edge.startswith(":") and here == api.edge.getBidiEdge(edge) and here not in way:
         return f"it reversed on edge {edge}"

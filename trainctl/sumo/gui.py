@@ -2,7 +2,7 @@
 
 Real tracks lie 4.5 m apart and trains kilometres: at a scale that shows a formation the net is one line. So the picture repeats
 the tracks farther apart, with a dot for every train, coloured by its role, and an arc for every link: above for what a train
-hears from ahead, below for what it hears from behind. It stands on the kilometrage, above the net; zoom in on the net to see the
+receives from ahead, below for what it receives from behind. It stands on the kilometrage, above the net; zoom in on it to see the
 trains themselves, which have the same colours. A net of any shape (``Map``) has no such picture: dots and links lie on it.
 """
 
@@ -26,7 +26,7 @@ from trainctl.errors import InputError, SimulatorError
 from trainctl.signals import Floats, Ints, Links, Start
 from trainctl.sumo.session import Sumo
 
-#: First of a formation; any other member; a train that hears nobody. Told apart by the colour-blind too.
+#: First of a formation; any other member; a train that receives from none. The colour-blind can tell them apart, too.
 FIRST, MEMBER, ALONE = (213, 94, 0, 255), (0, 114, 178, 255), (120, 120, 120, 255)
 TRACK, LINK = (150, 150, 150, 255), (0, 158, 115, 255)
 
@@ -157,7 +157,7 @@ class Gui(Sumo):
         try:
             return function(*arguments, **more)
         except traci.FatalTraCIError:
-            raise SimulatorError(f"{self.binary} is gone before the end: was its window closed?") from None
+            raise SimulatorError(f"{self.binary} ended before the run did: was its window closed?") from None
         except traci.TraCIException as error:
             raise SimulatorError(f"SUMO: {error}") from None
 

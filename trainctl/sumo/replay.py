@@ -228,7 +228,7 @@ def _between(line: Line, here: int, there: int) -> list[int]:
 
 
 def _changes(run: Run, times: Floats, ids: list[str], track: Ints, position: Floats) -> dict[float, tuple[Links, Ints]]:
-    """Who hears whom, and the track of each train, at the instants where that changed."""
+    """Who receives from whom, and the track of each train, at the instants where that changed."""
     table = run.links[["time_s", "sender", "receiver", "heard"]] if len(run.links) else pd.DataFrame()
     rows = zip(*(table[c].tolist() for c in table.columns), strict=True)
     number = {name: i for i, name in enumerate(ids)}

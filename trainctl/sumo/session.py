@@ -119,7 +119,7 @@ class Session:
             self.api.close()
             torn = [name for key, name in self.logs.items() if key != "log" and not _ended(self.folder / name)]
             if torn:
-                raise SimulatorError(f"SUMO left {', '.join(torn)} incomplete without a word: is the disk full?")
+                raise SimulatorError(f"SUMO left {', '.join(torn)} incomplete and gave no reason: is the disk full?")
 
     def messages(self) -> list[tuple[float | None, str]]:
         """Warnings and errors SUMO wrote, with the time it named, if any."""
@@ -248,9 +248,9 @@ class Sumo(Session):
                 ahead = np.flatnonzero(self.ways.edge[row:end] == edge)
                 found[k] = row + ahead[0]
             except (self.api.TraCIException, KeyError, IndexError) as error:
-                why = "it left its way" if isinstance(error, IndexError) else str(error)
+                why = "it left its route" if isinstance(error, IndexError) else str(error)
                 raise CouplingError(
-                    f"train {self.ids[i]} is not on its way at {self.now():.3f} s: {why} (likely cause: {self._cause(i)})"
+                    f"train {self.ids[i]} is not on its route at {self.now():.3f} s: {why} (likely cause: {self._cause(i)})"
                 ) from None
         return found
 

@@ -131,7 +131,7 @@ def row_of(session: Session, rails: Rails | None, i: int, edge: str) -> int:
             return row + int(onward[0])
         if rails is not None:
             _take_over(session, rails, i, edge)
-    raise CouplingError(f"train {session.ids[i]} left its way on edge {edge} at {session.now():.3f} s")
+    raise CouplingError(f"train {session.ids[i]} left its route on edge {edge} at {session.now():.3f} s")
 
 
 def _take_over(session: Session, rails: Rails, i: int, edge: str) -> None:

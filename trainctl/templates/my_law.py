@@ -37,7 +37,7 @@ def violations(params: Params, scene: Scene) -> list[str]:
 
 
 def constants(params: Params, scene: Scene) -> Params:
-    """What ``message`` and ``demand`` get; made anew when the links change."""
+    """What ``message`` and ``demand`` get; computed again when the links change."""
     return params
 
 

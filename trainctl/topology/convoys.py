@@ -1,6 +1,6 @@
-"""Formations along routes: every train is coupled to the next one ahead on its way, or drives alone.
+"""Formations along routes: every train is coupled to the next one ahead on its route, or drives alone.
 
-A formation is a chain of coupled trains. It comes about link by link: a train whose way leads behind another one draws near until
+A formation is a chain of coupled trains. It forms link by link: a train whose route leads behind another one draws near until
 the law may take over, then it couples; it uncouples when another train comes between, when its way branches off, and when it has
 to stop. So the order at a join of tracks is that of the trains that come, and nobody has to know the net.
 """
@@ -66,7 +66,7 @@ def slots(ahead: Ints, order: Ints, desired: float, lead: Floats) -> Floats:
 
 
 def links(ahead: Ints, order: Ints, slot: Floats, spacing: Spacing) -> Links:
-    """The edge list of all formations: every train and the one it is coupled to hear each other."""
+    """The edge list of all formations: every train and the one it is coupled to receive from each other."""
     n = len(ahead)
     behind = np.flatnonzero(ahead >= 0)
     sender, receiver = np.concatenate([ahead[behind], behind]), np.concatenate([behind, ahead[behind]])

@@ -2,7 +2,7 @@
 
 Each link has a channel of its own. It loses messages independently, or in bursts: Gilbert's and Elliott's two states [1]_, [2]_,
 between which it turns with fixed probabilities from exchange to exchange. A message is under way for a fixed time, and a random
-one on top; one that is overtaken by a newer one is of no use any more. Trains whose radio is out neither send nor hear. What is
+one on top; one that is overtaken by a newer one is discarded. Trains whose radio is out neither send nor receive. What is
 drawn is a function of the seed, the number of the exchange, the sender and the receiver: nobody's luck depends on who else there
 is.
 
@@ -98,7 +98,7 @@ def deliver(
     position : ndarray, shape (n,)
         Where every train believes to be [m].
     links : Links
-        Who hears whom.
+        Who receives from whom.
     count : int
         Number of the exchange.
     t : float

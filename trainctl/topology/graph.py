@@ -1,4 +1,4 @@
-"""Who hears whom: a pure function of positions, tracks and a rule.
+"""Who receives from whom: a pure function of positions, tracks and a rule.
 
 A ``Plan`` is what the scenario says, fixed for the run; ``links`` turns it, with tracks and order, into the edge list the laws see.
 Spacings are front to front.
@@ -27,8 +27,8 @@ class Plan(NamedTuple):
     """The scenario's rule, trains as in its tables; ``place`` (n,) is which each is in the formation, 0 the first.
 
     ``desired``, ``lower``, ``upper`` (n - 1,) belong to consecutive places; ``stated`` to (sender, receiver), mirrored where both
-    hear each other; ``extra`` are pairs that hear each other whenever both are on one track, ``fixed`` the directed pairs of rule
-    "links".
+    receive from each other; ``extra`` are such pairs that do so whenever both are on one track, ``fixed`` the directed pairs of
+    rule "links".
     """
 
     rule: Literal["same_track", "links"]

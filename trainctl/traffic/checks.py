@@ -40,7 +40,7 @@ def rail_trains(elements: Elements, kinds: dict[str, Kind]) -> tuple[list[Elemen
         for word in ("random", "free", "random_free")
         if (n := sum(t.get(key) == word for t in trains))
     ]
-    notes += [f"{', '.join(random)}: drawn here, with other numbers than SUMO's"] if random else []
+    notes += [f"{', '.join(random)}: drawn here, with random numbers other than SUMO's"] if random else []
     drawn = {t.get("type", "") for t in trains}
     drawn |= {member for name in drawn & set(elements.mixes) for member in types_of(elements.mixes[name])}
     for name in sorted(drawn & set(kinds)):

@@ -57,7 +57,7 @@ def choices(elements: list[Element], routes: Mapping[str, Element], tracks: Trac
                 if not ways or wrong or bad_number(chance) or not all(map(is_time, times)):
                     continue
                 if sum(w > 0.0 for w in weights) > 1:
-                    notes.append(f"{who}: <{tag}>: drawn here, with other numbers than SUMO's")
+                    notes.append(f"{who}: <{tag}>: drawn here, with random numbers other than SUMO's")
                 if sum(weights) > 0.0:
                     at, types = tuple(rerouter.get("edges", "").split()), tuple(rerouter.get("vTypes", "").split())
                     begin, end = map(seconds, times)

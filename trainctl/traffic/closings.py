@@ -65,7 +65,7 @@ def closings(elements: list[Element], tracks: Tracks, classes: set[str]) -> tupl
                         span = seconds(times[0]), seconds(times[1])
                         found.append(Closing(at, edge, *span, float(chance), tuple(rerouter.get("vTypes", "").split()), shut))
         if 0.0 < float(chance if not bad_number(chance) else "1") < 1.0:
-            notes.append(f"{who}: probability = {chance}: drawn here, with other numbers than SUMO's")
+            notes.append(f"{who}: probability = {chance}: drawn here, with random numbers other than SUMO's")
         wrong += mistakes
     return found, list(dict.fromkeys(notes)), wrong
 

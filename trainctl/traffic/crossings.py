@@ -1,4 +1,4 @@
-"""Where routes cross without a junction that says so: nobody keeps trains apart there, SUMO neither."""
+"""Where routes cross without a junction that says so: nothing keeps trains apart there, nor does SUMO."""
 
 from __future__ import annotations
 

@@ -130,7 +130,7 @@ def _told(words: str, tags: dict[str, str]) -> list[str]:
     for line in words.splitlines():
         _, _, said = line.partition(": ")
         if found := re.match(r"No connection between edge '(.*)' and edge '(.*)' found", said):
-            gap = f"no way from edge {found[1]} to edge {found[2]}"
+            gap = f"no path from edge {found[1]} to edge {found[2]}"
             continue
         for pattern, meaning in patterns:
             if found := re.match(pattern, said):

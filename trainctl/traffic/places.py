@@ -15,7 +15,7 @@ from trainctl.errors import InputError
 from trainctl.traffic.files import PLACES, Elements, bad_number, bad_time, is_number, is_time, seconds
 
 #: What is said of a road net.
-NO_RAIL = "has no rail edges: none of its lanes allows a rail class by name, and no route runs over one that lets everybody on"
+NO_RAIL = "has no rail edges: none of its lanes allows a rail class by name, and no route runs over one that is open to all classes"
 
 
 #: How SUMO's files say yes.
@@ -100,7 +100,7 @@ def place_of(stop: Element, elements: Elements, tracks: Tracks) -> Place:
     lane = where.get("lane") or (f"{where.get('edge')}_0" if where.get("edge") else "")
     said = f"stop at {name}" if name else f"stop on edge {lane.rpartition('_')[0]}"
     if not lane:
-        return Place(lane, 0.0, "a stop has neither a lane nor an edge nor a place to stop at")
+        return Place(lane, 0.0, "a stop names neither a lane nor an edge nor a stopping place")
     if lane not in tracks.length:
         return Place(lane, 0.0, f"{said}: lane {lane}: not in the net")
     length = tracks.length[lane]
@@ -137,7 +137,7 @@ def unconnected(edges: list[str], tracks: Tracks) -> list[str]:
     return unknown or [
         f"cannot turn back from edge {a} to edge {b}: the net has no connection there"
         if tracks.twin.get(a) == b
-        else f"its route is not connected: no way from edge {a} to edge {b}"
+        else f"its route is not connected: no path from edge {a} to edge {b}"
         for a, b in pairwise(edges)
         if b not in tracks.onward[a]
     ]

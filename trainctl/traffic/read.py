@@ -184,7 +184,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
     departures = []
     handed: dict[str, tuple[Element, Element, tuple[str, ...]]] = {}
     wrong = [
-        f"{'flow' if t.tag == 'flow' else 'train'} {t.get('id')}: duarouter makes no route of it; are all its edges for its vClass?"
+        f"{'flow' if t.tag == 'flow' else 'train'} {t.get('id')}: duarouter finds no route; are all its edges open to its vClass?"
         for t in trains
         if t.get("id") not in made and _comes(t, begin, min(ends, default=math.inf))
     ]
@@ -207,7 +207,8 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
     used = {d.kind for _, d in departures}
     if plain := unmarked((e for _, d in departures for e in d.edges), tracks):
         notes.append(
-            f"net: {len(plain)} x edges of routes let everybody on, no rail class by name: tracks without their road traffic"
+            f"net: {len(plain)} x edges of routes are open to all classes, to no rail class by name: taken for tracks without"
+            " road traffic"
         )
     notes += crossings.told(tracks.file, [d.edges for _, d in departures])
     return Configuration(
@@ -384,7 +385,7 @@ def _backwards(stops: list[Element], arrivals: list[float | None], places: list[
             if planned is not None and planned < last:
                 edge = place.lane.rpartition("_")[0]
                 wrong.append(
-                    f"stop on edge {edge}: {key} = {planned:g} s: must not be before {last:g} s, planned earlier on its way"
+                    f"stop on edge {edge}: {key} = {planned:g} s: must not be before {last:g} s, planned earlier on its route"
                 )
             last = max(last, planned or 0.0)
     return wrong

@@ -37,7 +37,7 @@ def scaled(trains: list[Element], everybody: list[Element], scale: float, suffix
     ]
     if scale % 1.0 and single and any(v.tag == "flow" for v in everybody):
         notes.append(
-            f"option scale = {scale:g}: not followed: SUMO counts trains of flows, too, where it decides who comes once more"
+            f"option scale = {scale:g}: not followed: SUMO counts trains of flows as well when it decides which one comes once more"
         )
     return found, notes
 

@@ -51,4 +51,4 @@ def _loaded(called: str, *options: str) -> None:
         raise InputError(f"{called}: SUMO does not load it within {PATIENCE_S:g} s") from None
     if done.returncode != 0:
         said = [line.removeprefix("Error: ") for line in done.stderr.splitlines() if line.startswith("Error: ")]
-        raise InputError([f"{called}: SUMO refuses it: {line}" for line in said[:5]] or [f"{called}: SUMO dies of it"])
+        raise InputError([f"{called}: SUMO refuses it: {line}" for line in said[:5]] or [f"{called}: SUMO crashes on it"])

@@ -16,6 +16,8 @@ from trainctl.cli import console
 from trainctl.cli import program as cli
 from trainctl.cli.console import number
 from trainctl.record.folder import run_name
+from trainctl.scenario.build import open_scenario
+from trainctl.scenario.check import WORDS, facts, in_words
 from trainctl.scenario.reading import read
 
 BIN = Path(sys.executable).parent / "trainctl"
@@ -77,6 +79,16 @@ def test_list_check_and_schema_are_json_too():
     facts = json.loads(typed("check", "three_tracks", "--json").stdout)
     assert facts["smallest_control_period_s"] == pytest.approx(6.265, abs=1e-3)
     assert "train_type" in json.loads(typed("schema").stdout)["properties"]
+
+
+@pytest.mark.parametrize("name", ["three_tracks", "emu_finite_time", "merging"])
+def test_the_table_of_check_has_words_and_units_for_people_and_no_keys(name):
+    found = facts(open_scenario(name))
+    rows = in_words(found)
+    assert len(rows) >= 8 and not [words for words, _ in rows if "_" in words or "=" in words]
+    assert dict(rows)["step"] == "1 s"
+    assert name != "three_tracks" or dict(rows)["input every train can give"] == "-0.8 .. 0.352941 m/s2"
+    assert set(WORDS) & set(found)
 
 
 def test_figures_are_written(folder):

@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from limits import bounded
 
+from sumo_net import LineError
 from trainctl.cli import program as cli
 from trainctl.errors import InputError
 from trainctl.runner import run
@@ -235,12 +236,32 @@ def read_by(name: str, path: Path) -> None:
         make_golden(path, path.parent / "golden", 60.0)
 
 
-@pytest.mark.parametrize(("reader", "root"), [("net", b"net"), ("sumo", b"additional"), ("golden", b"tripinfos")])
-def test_a_gzip_bomb_does_not_take_the_memory(reader, root, tmp_path):
+@pytest.mark.parametrize(
+    ("reader", "root"), [("net", b"net"), ("sumo", b"additional"), ("golden", b"tripinfos"), ("fcd", b"fcd-export")]
+)
+def test_a_gzip_bomb_takes_neither_memory_nor_time(reader, root, tmp_path):
     path = bomb(tmp_path / "bomb.xml.gz", root)
+    refused = []
     with bounded(1 << 28):
-        read_by(reader, path)
-        assert reader == "golden", "not refused"  # which reads it piece by piece
+        try:
+            read_by(reader, path)
+        except (InputError, LineError) as error:
+            refused = error.mistakes
+            raise
+    assert len(refused) == 1 and "times its size" in refused[0]
+
+
+def test_a_log_of_trains_that_stand_for_hours_is_no_bomb(tmp_path):
+    """Nothing that SUMO writes is packed better."""
+    from trainctl.metrics.traffic import metrics_of_fcd
+    from trainctl.runs.sumo_logs import TIMES
+
+    rows = "".join(f'<vehicle id="t{k}" x="{k}.00" y="-1.60" speed="0.00" pos="{k}.00" lane="e{k}_0"/>\n' for k in range(20))
+    text = "".join(f'<timestep time="{t}.00">\n{rows}</timestep>\n' for t in range(4000)).encode()
+    path = tmp_path / "fcd.xml.gz"
+    path.write_bytes(gzip.compress(b"<fcd-export>\n" + text + b"</fcd-export>\n"))
+    assert 100 < len(text) / path.stat().st_size < TIMES / 2
+    assert metrics_of_fcd(path)["fcd.standing_share"] == 1.0
 
 
 @pytest.mark.parametrize("reader", ["net", "sumo", "fcd"])

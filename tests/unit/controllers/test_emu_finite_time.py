@@ -228,9 +228,9 @@ def test_links_that_contradict_the_slots_are_told() -> None:
         ({"compression_zone_m": 0.2}, "controller.compression_zone_m = 0.2: must be below coupler_compression_m = 0.1"),
         (
             {"emergency_zone_m": 1500.0},
-            "trains 1 and 2: wanted interval = 3000 m: must exceed emergency_distance_m + emergency_zone_m = 3000",
+            "trains 1 and 2: desired interval = 3000 m: must exceed emergency_distance_m + emergency_zone_m = 3000",
         ),
-        ({"range_m": 4000.0}, "trains 1 and 2: wanted interval = 3000 m: must be below range_m - range_zone_m = 3000"),
+        ({"range_m": 4000.0}, "trains 1 and 2: desired interval = 3000 m: must be below range_m - range_zone_m = 3000"),
     ],
 )
 def test_zones_that_do_not_fit_are_told(keys: dict[str, float], words: str) -> None:

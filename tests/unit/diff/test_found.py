@@ -57,7 +57,7 @@ CASES = {
     "column missing": ("trains", without("time_s"), "trains: has no column time_s"),
     "key missing": ("units", without("unit"), "units: has no column unit"),
     "link column missing": ("links", without("lower_m"), "links: has no column lower_m"),
-    "column twice": ("links", doubled("desired_m"), "links: a column stands more than once"),
+    "column twice": ("links", doubled("desired_m"), "links: a column appears more than once"),
     "texts for numbers": ("trains", texts("speed_mps"), "trains.speed_mps: must be numbers, not string"),
     "number missing": ("links", number("spacing_m", None), "links.spacing_m: a number is missing"),
     "number not finite": ("trains", number("position_m", float("nan")), "trains.position_m: a number is missing or not finite"),

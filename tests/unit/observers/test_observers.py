@@ -210,7 +210,7 @@ def test_width_follows_the_fault_model():
         ({"fault_constant_n_per_s": 0.0}, ["constant fault is unobservable"]),
         ({"fault_sinusoids": [[0.0, 2e5], [1.0, 0.0]]}, ["neither may be 0", "neither may be 0"]),
         ({"fault_sinusoids": [[-1.0, 2e5]]}, ["omega must be above 0"]),
-        ({"fault_sinusoids": [[1.0, 2e5], [1.0, 1e5]]}, ["this omega stands twice"]),
+        ({"fault_sinusoids": [[1.0, 2e5], [1.0, 1e5]]}, ["this omega appears twice"]),
         ({"pole_per_s": -60.0}, ["too fast for a sub-step of 0.01 s"]),
         ({}, []),
     ],

@@ -42,7 +42,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("small")
-def test_trains_that_hear_each_other_are_in_one_block():
+def test_trains_that_receive_from_each_other_are_in_one_block():
     """Formations 0-1-2, 3 and 4-5; links go by the order of formations on their tracks."""
     first, links = np.arange(7) * 4, linked([(0, 1), (1, 2), (4, 5)], 6, [4, 5, 3, 0, 1, 2])
     for number in (1, 2, 3, 4):
@@ -53,7 +53,7 @@ def test_trains_that_hear_each_other_are_in_one_block():
         assert found.order.tolist() == [0, 1, 2, 3, 4, 5]
         assert 1 <= len(found.blocks) <= number
     assert len(threads.shares(first, links, True, 2).blocks) == 2
-    assert len(threads.shares(first, links, False, 6).blocks) == 6  # nobody hears anybody within a stretch
+    assert len(threads.shares(first, links, False, 6).blocks) == 6  # nobody receives anything within a stretch
 
 
 @pytest.mark.usefixtures("small")

@@ -28,7 +28,7 @@ from trainctl.runs.xml_rows import xml_rows
 
 #: What SUMO writes so that nobody can read it: one name for several columns; positions with commas between commas.
 REFUSALS = {
-    ("plain.csv", "ssm"): "a column stands more than once", ("plain.csv", "persons"): "a column stands more than once",
+    ("plain.csv", "ssm"): "a column appears more than once", ("plain.csv", "persons"): "a column appears more than once",
     ("comma.csv", "ssm"): "not a CSV log", ("comma.csv", "collisions"): "not a CSV log",
 }  # fmt: skip
 

@@ -91,7 +91,7 @@ CASES = {
     ),
     "line too short": (PAPER + "[run]\nduration_s = 6000\n", ["run.duration_s = 6000: at the reference speed train 1 reaches 504000 m"]),
     "not TOML": ("a = = 3", ["not a TOML file"]),
-    "extends itself": ('extends = "mistaken.toml"\n', ["comes back to itself"]),
+    "extends itself": ('extends = "mistaken.toml"\n', ["leads back to itself"]),
 }  # fmt: skip
 
 

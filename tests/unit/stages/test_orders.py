@@ -33,7 +33,7 @@ class Asked:
         seen = self.world.measure()._replace(**where)
         speeds, rules = np.full(6, speed), self.p.supervision
         stops_in = supervisor.way_to_stop(rules, self.p.assumed, speeds, np.zeros(6), 1.0, self.p.step_theta)
-        return self.orders.step(t, seen, self.world.ways, speeds, stops_in, self.alone if ahead is None else ahead, pending)
+        return self.orders.step(t, seen, self.world.ways, speeds, lambda: stops_in, self.alone if ahead is None else ahead, pending)
 
     def order(self, **more):
         return self.orders.added(Event(kind="reroute", train="1", **more), State((), []))

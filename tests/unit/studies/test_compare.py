@@ -87,7 +87,7 @@ def test_laws_that_cannot_drive_the_traffic_are_named_with_the_reason(tmp_path):
     told = json.loads(done.stdout)
     assert {"fully_distributed", "robust_constrained"} <= set(told["runs"])
     assert any("runs on coupled_units" in reason for reason in told["left_out"]["emu_finite_time"])
-    assert any("SUMO drives by itself" in reason for reason in told["left_out"]["sumo_fixed_block"])
+    assert any("SUMO drives the trains itself" in reason for reason in told["left_out"]["sumo_fixed_block"])
     assert (tmp_path / "fully_distributed" / "run.json").is_file()
     assert (tmp_path / "compare_speeds.png").is_file()
     assert "fully" in (tmp_path / "compare.tex").read_text() and told["latex"] == str(tmp_path / "compare.tex")

@@ -54,7 +54,7 @@ def test_cells_are_the_same_with_one_and_two_workers_and_resumed(tmp_path, monke
     shutil.rmtree(tmp_path / "two" / "cells" / "sliding_mode" / "stop")
     again = suite.compare(PLAN, tmp_path / "two", rows, names, workers=1, resume=True)
     assert again[0]["failed"] == 1 and again[3] == one[3]  # what was done stays, the rest is run
-    with pytest.raises(InputError, match="asks something else"):
+    with pytest.raises(InputError, match="has another plan"):
         suite.compare(PLAN._replace(runs=3), tmp_path / "two", rows, names, resume=True)
 
 

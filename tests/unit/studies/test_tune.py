@@ -40,7 +40,7 @@ def test_ranges_and_objectives_as_they_are_typed():
     [
         ({"scenario": "fully_distributed"}, "controller.law = fully_distributed: has no gains"),
         ({"gains": ()}, "--gain: missing; the numbers of law robust_constrained are h_per_s = 0.3"),
-        ({"gains": (Gain("k", 0.0, 1.0),)}, "--gain k: no number of law robust_constrained; there are: h_per_s"),
+        ({"gains": (Gain("k", 0.0, 1.0),)}, "--gain k: not a number of law robust_constrained; there are: h_per_s"),
         ({"seeds": ()}, "--seeds: missing"),
         ({"evaluations": 5}, "--evaluations 5: at least"),
         ({"settings": {"supervisor.mode": "on"}}, "cannot be taken side by side: supervisor.mode is not off"),

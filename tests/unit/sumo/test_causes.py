@@ -43,7 +43,7 @@ CAUSES: dict[str, tuple[Callable[[], object], str]] = {
     "stop": (stop, "a stop that SUMO holds it at"),
     "route": (lambda: libsumo.vehicle.setRoute("v", ["ab", "bd"]), "SUMO gave it another route, over edge bd: a rerouter"),
     "speed mode": (slowly, "its speed mode is 31, not 32"),
-    "cut": (lambda: libsumo.vehicle.setRoute("v", ["ab"]), "SUMO let it arrive before the end of its way, on edge ab"),
+    "cut": (lambda: libsumo.vehicle.setRoute("v", ["ab"]), "SUMO let it arrive before the end of its route, on edge ab"),
 }
 
 

@@ -155,7 +155,7 @@ def test_command_writes_a_line_that_builds(tmp_path, monkeypatch, capsys):
     assert sumo_net.Line.read(tmp_path / "Hill_Line.net.xml").gradient.slope.tolist() == [0.01, -0.0205]
     (tmp_path / "track.json").write_text(json.dumps(track(stops=None)))
     code, said = call("import", tmp_path / "track.json")
-    assert (code, said.err) == (2, "track.json: stops: missing, and it would tell the length of the line: give --length-m\n")
+    assert (code, said.err) == (2, "track.json: stops: missing, so the length of the line is not known: give --length-m\n")
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the files of TTOBench and TrainRuns.jl are not here")

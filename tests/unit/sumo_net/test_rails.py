@@ -537,7 +537,7 @@ def test_every_mistake_is_named_at_once(convert):
         Rails.read(net)
     assert [m.removeprefix(f"{net}: ") for m in caught.value.mistakes] == ["edge cn: has no length", "edge wc: has no length"]
     net.write_text(words.replace('foes="10"', 'fees="10"'))
-    with pytest.raises(LineError, match="junction c: its requests are broken"):
+    with pytest.raises(LineError, match="junction c: its requests cannot be read"):
         Rails.read(net)
 
 

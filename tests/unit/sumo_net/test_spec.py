@@ -77,7 +77,7 @@ def test_defaults():
         ({"name": "-a"}, r"name = -a: must be letters"),
         ({"name": None}, r"name: missing"),
         ({"tracks": []}, r"tracks = \[\]: must have at least one item"),
-        ({"tracks": [1, "1", 3], "crossover": [], "regular_crossovers": None}, r"tracks = 1: stands more than once"),
+        ({"tracks": [1, "1", 3], "crossover": [], "regular_crossovers": None}, r"tracks = 1: appears more than once"),
         ({"tracks": [1, 3, 2.5]}, r"tracks\[3\] = 2.5: must be a valid string"),
         ({"tracks": [1, 3, "x_y"]}, r"tracks\[3\] = x_y: must be letters, digits or \., and begin"),
         ({"length_m": -1.0}, r"length_m = -1.0: must be greater than 0"),
@@ -166,7 +166,7 @@ def test_defaults():
         ),
         (
             {"regular_crossovers": GOOD["regular_crossovers"] | {"first_m": 30900.0}},
-            r"regular_crossovers.first_m = 30900: the first lies not wholly inside the line",
+            r"regular_crossovers.first_m = 30900: the first does not lie wholly inside the line",
         ),
         (
             {"regular_crossovers": GOOD["regular_crossovers"] | {"length_m": 10.0}},

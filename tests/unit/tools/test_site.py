@@ -36,7 +36,6 @@ def test_every_page_and_notebook_is_in_the_navigation():
     assert there | {"reference/commands.md", "reference/python.md"} == set(named(yaml.safe_load(site.CONFIG.read_text())["nav"]))
 
 
-@pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="mkdocs is not installed (extra: site)")
 def test_the_site_is_built_without_a_warning_and_loads_nothing_from_elsewhere(tmp_path):
     done = site.build(tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -303,7 +303,7 @@ def test_what_is_not_followed_is_told(files: Files) -> None:
         "1 definitions of persons left out",
         "1 definitions of containers left out",
         "2 vehicles, trips and flows left out: not rail",
-        '1 x departPos="random": drawn here, with other numbers than SUMO\'s',
+        '1 x departPos="random": drawn here, with random numbers other than SUMO\'s',
         "vType loose: speedFactor = normc(0.8,0.1,0.2,1): its mean 0.8 for every train",
         "option step-length = 0.5: not followed: the step is run.step_s of the scenario",
         "1 x <vehicle arrivalSpeed>: not followed: trains leave as fast as they come",
@@ -343,14 +343,14 @@ def test_what_cannot_be_followed_is_refused_with_the_reason(files: Files, key: s
 
 
 MISTAKES = {
-    f'{V}><route edges="ab cd"/></vehicle>': ["train v: its route is not connected: no way from edge ab to edge cd"],
-    '<flow id="u" type="t" begin="0" period="10" from="bc" to="ab"/>': ["flow u: no way from edge bc to edge ab"],
+    f'{V}><route edges="ab cd"/></vehicle>': ["train v: its route is not connected: no path from edge ab to edge cd"],
+    '<flow id="u" type="t" begin="0" period="10" from="bc" to="ab"/>': ["flow u: no path from edge bc to edge ab"],
     f'{V}><route edges="ab nope"/></vehicle>': ["train v: edge nope: not in the net"],
     '<vehicle id="v" type="ghost" depart="0" route="main"/>': ["train v: type = ghost: no such vType"],
     f'{V} route="ghost"/>': ["train v: route = ghost: no such route"],
     '<trip id="v" type="t" depart="0" from="cd" to="ab"/><trip id="w" type="t" depart="3" from="bc" to="ab"/>': [
-        "train v: no way from edge cd to edge ab",
-        "train w: no way from edge bc to edge ab",
+        "train v: no path from edge cd to edge ab",
+        "train w: no path from edge bc to edge ab",
     ],
     '<trip id="v" type="t" depart="0" from="ab" to="nope"/>': ["train v: edge nope: not in the net"],
     f'{V}><route edges="ab bc"/><stop busStop="east" duration="3"/></vehicle>': ["train v: stop on edge cd: not on its route"],
@@ -370,11 +370,11 @@ MISTAKES = {
     ],
     f'{V} route="main" departSpeed="-1"/>': ["train v: departSpeed = -1: must not be negative"],
     f"{V}/>": ["train v: no route"],
-    f'{V}><route edges="zx"/></vehicle>': ["train v: duarouter makes no route of it; are all its edges for its vClass?"],
+    f'{V}><route edges="zx"/></vehicle>': ["train v: duarouter finds no route; are all its edges open to its vClass?"],
     '<flow id="v" type="t" begin="0" end="9" number="2"><route edges="zx"/></flow>': [
-        "flow v: duarouter makes no route of it; are all its edges for its vClass?"
+        "flow v: duarouter finds no route; are all its edges open to its vClass?"
     ],
-    f'{V} route="main"><stop duration="4"/></vehicle>': ["train v: a stop has neither a lane nor an edge nor a place to stop at"],
+    f'{V} route="main"><stop duration="4"/></vehicle>': ["train v: a stop names neither a lane nor an edge nor a stopping place"],
     f'{V} route="main"/>{V} route="main"/>': ["train v: there are several of this id"],
     '<vType id="bad" vClass="rail" length="long"/>': ["vType bad: length = long: must be a number, not negative"],
     f'{V} route="ghost"/><vehicle id="w" type="ghost" depart="containerTriggered" route="main"/>': [
