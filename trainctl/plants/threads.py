@@ -39,7 +39,9 @@ ALONE = Shares((), np.zeros(0, np.int64))
 def cores() -> int:
     """How many threads there may be: as the environment says, or as many as the process has cores."""
     given = os.environ.get(THREADS, "")
-    return max(int(given), 1) if given.isdigit() else len(os.sched_getaffinity(0))
+    if given.isdigit():
+        return max(int(given), 1)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1  # macOS has none
 
 
 def shares(first: Ints, links: Links, talk: bool, threads: int) -> Shares:
