@@ -57,7 +57,7 @@ class Rails:
             are allowed. In a net that ``sumo_net`` built, order and kilometrage are those of ``Line.read``.
 
         over : collection of str
-            Edges that trains run over; they are taken too if they let everybody on.
+            Edges that trains run over; they are taken too if they are open to all classes.
 
         Raises
         ------

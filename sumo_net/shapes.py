@@ -24,7 +24,7 @@ class Piece(NamedTuple):
 
 
 def shapes(net: Path, over: Collection[str] = ()) -> list[Piece]:
-    """The rail edges of a net in its own coordinates, in the order of the file; those of ``over`` also if they let everybody on.
+    """The rail edges of a net in its own coordinates, in the order of the file; those of ``over`` also if open to all classes.
 
     Raises
     ------

@@ -432,6 +432,9 @@ class Deaf:
     def write(self, row: Any) -> None:
         """One instant."""
 
+    def turned(self, p: Model) -> None:
+        """Trains that run the other way round."""
+
 
 def opened(case: Case, mode: str) -> Model:
     """The scenario, checked."""

@@ -203,6 +203,32 @@ def platforms(folder: Path, draw: random.Random, signals: bool = False) -> list[
     return ["wi m p1 eo", "ei p2 -m wo"]
 
 
+def terminals(folder: Path, draw: random.Random) -> list[str]:
+    """Single track from a terminal to two others, with stations between; trains turn back in each."""
+    a, b, c = (draw.choice([draw.uniform(300.0, 1700.0), draw.uniform(1700.0, 5000.0)]) for _ in range(3))
+    nodes = {"a": (0.0, 0.0), "b": (a, 0.0), "c": (a + b, 0.0), "d": (a + 0.9 * c, 0.4 * c)}
+    edges = {
+        **both_ways("ab", "a", "b", speed=speed(draw)), **both_ways("bc", "b", "c", speed=speed(draw)),
+        **both_ways("bd", "b", "d", speed=speed(draw)),
+    }  # fmt: skip
+    net(folder, nodes, edges, nets.TERMINALS, *draw.choice([(), ("--no-internal-links",)]))
+    return ["ab bc -bc -ab", "-bc -ab ab bd", "ab bd -bd -ab ab bc", "-bd -ab", "-bc -ab ab bc -bc -ab"]
+
+
+def heads(folder: Path, draw: random.Random) -> list[str]:
+    """A double track that ends in a station of two platforms, with one edge more before each dead end now and then."""
+    far, size = draw.uniform(2500.0, 7000.0), draw.choice([draw.uniform(300.0, 900.0), draw.uniform(900.0, 2500.0)])
+    nodes = {"a": (0.0, 0.0), "z": (0.0, -40.0), "s": (far, 0.0), "t1": (far + size, 40.0), "t2": (far + size, -40.0)}
+    edges: dict[str, Any] = {"up": ("a", "s", {"speed": speed(draw)}), "down": ("s", "z", {"speed": speed(draw)})}
+    edges |= {**both_ways("p1", "s", "t1", speed=speed(draw)), **both_ways("p2", "s", "t2", speed=speed(draw))}
+    more = draw.random() < 0.5
+    if more:
+        nodes["u1"] = (far + size + draw.uniform(50.0, 600.0), 40.0)
+        edges |= both_ways("q1", "t1", "u1", speed=speed(draw))
+    net(folder, nodes, edges, nets.TERMINALS)
+    return ["up p1 q1 -q1 -p1 down" if more else "up p1 -p1 down", "up p2 -p2 down", "-p2 down"]
+
+
 def crossing(folder: Path, draw: random.Random, signals: bool = False) -> list[str]:
     """Two lines that cross, with a turn from the one to the other; some sides are short."""
     away = {"w": (-1, 0), "e": (1, 0), "n": (0, 1), "s": (0, -1)}

@@ -7,6 +7,7 @@ closed, trains are sent elsewhere or in an order, faults begin on the way, and l
 from __future__ import annotations
 
 import random
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,29 +16,41 @@ from xml.etree import ElementTree
 import hostile_nets
 from hostile import PLANTS, Case, Plants, base, coarser, fleet, supervisor, written
 
+from trainctl import runner
+from trainctl.errors import TrainctlError
+from trainctl.runner import Backend
+from trainctl.scenario.build import open_scenario
+
 #: Styles of the continuous law that answer what happens within the step.
 REACTING = ("twitch", "neighbour")
 
 #: With which trains enter; SUMO refuses those of its own that are too fast for their edge.
 SPEEDS = ("max", "max", "10", "0", "25", "40", "avg", "speedLimit")
 
+#: Files of a run that are the same however often it was resumed.
+FILES = ("trains.parquet", "events.jsonl", "metrics.json")
+
 #: Nets, the first ones also with signals.
 SIGNALLED = (
     hostile_nets.two_ways, hostile_nets.two_ways, hostile_nets.laps, hostile_nets.platforms, hostile_nets.platforms, hostile_nets.crossing,
 )  # fmt: skip
+TURNING = (hostile_nets.terminals, hostile_nets.heads)
 NETS = (*SIGNALLED, hostile_nets.short_edges, hostile_nets.joins_in_a_row, hostile_nets.loops, hostile_nets.hills)
 
 
-def drawn(seed: int, place: Path, plants: Plants = PLANTS, signals: bool = False) -> Case:
-    """Draw a case into ``place/traffic.SEED``; ``signals``: SUMO's, which are obeyed, and some trains are by themselves or SUMO's own."""
-    draw = random.Random(f"hostile traffic {seed} {signals}")
-    folder = place / f"{'signals' if signals else 'traffic'}.{seed}"
+def drawn(seed: int, place: Path, plants: Plants = PLANTS, signals: bool = False, turning: bool = False) -> Case:
+    """Draw a case into ``place/traffic.SEED``.
+
+    ``signals``: SUMO's, which are obeyed, and some trains are by themselves or SUMO's own; ``turning``: most trains turn back.
+    """
+    draw = random.Random(f"hostile traffic {seed} {signals}{' turning' if turning else ''}")
+    folder = place / f"{'signals' if signals else 'turning' if turning else 'traffic'}.{seed}"
     folder.mkdir(parents=True, exist_ok=True)
     kind, continuous, _ = draw.choices(plants, [weight for *_, weight in plants])[0]
     tables = base(draw, seed, kind, continuous)
     if continuous and draw.random() < 0.4:
         tables["controller"]["style"] = draw.choice(REACTING)
-    lay = draw.choice(SIGNALLED if signals else NETS)
+    lay = draw.choice(SIGNALLED if signals else TURNING if turning else NETS)
     routes = lay(folder, draw, signals=True) if signals else lay(folder, draw)
     duration = coarser(draw, tables) * draw.randint(120, 300)
     ids = [f"t{k}" for k in range(draw.randint(2, 8))]
@@ -73,7 +86,7 @@ def drawn(seed: int, place: Path, plants: Plants = PLANTS, signals: bool = False
         "network": {"sumocfg": "a.sumocfg"}, "reference": {"speed_mps": draw.choice([15.0, 25.0, 35.0])}, "plant": trains["k0"].plant,
         "train_type": {k: t.type for k, t in trains.items()}, "supervisor": supervisor(draw, braking), "disturbance": troubles,
         "fault": [one for one in faults if one["train"] in ours], "traffic": driving,
-        "event": ordered(draw, ours, sorted(lengths), duration), "order": in_turn(draw, ways),
+        "event": ordered(draw, ours, sorted(lengths), duration), "order": [] if turning else in_turn(draw, ways),
     }  # fmt: skip
     return written(
         draw, seed, f"{lay.__name__}{' signals' if signals else ''} {kind}{' continuous' if continuous else ''}", folder, tables
@@ -82,6 +95,27 @@ def drawn(seed: int, place: Path, plants: Plants = PLANTS, signals: bool = False
 
 #: Drawn with signals and trains of SUMO's, which SUMO alone knows.
 signalled = partial(drawn, signals=True)
+
+#: Drawn with trains that turn back.
+reversing = partial(drawn, turning=True)
+
+
+def resumed(case: Case, backend: Backend, share: float) -> list[str] | None:
+    """Break a run off at this share of its steps and go on with it: files that differ then. None: nothing to resume, it is refused."""
+    try:
+        p = open_scenario(str(case.folder / "s.toml"))
+        whole = runner.run(p, case.folder / "whole", backend)
+    except TrainctlError:
+        return None
+    broken = int(share * p.scenario.run.steps)
+    every = max(broken // 30, 1) * 10 * p.scenario.run.step_s
+    with suppress(ConnectionError), runner.opened(p, case.folder / "cut", backend, checkpoint_every_s=every) as simulation:
+        for _ in range(broken):
+            simulation.step()
+        raise ConnectionError
+    again, since = runner.resume(case.folder / "cut")
+    assert since is not None and since > 0.0
+    return [name for name in FILES if (whole.folder / name).read_bytes() != (again.folder / name).read_bytes()]
 
 
 def entering(

@@ -27,14 +27,15 @@ MOST_LOOKS = 64
 
 
 class Tracks(NamedTuple):
-    """Where n trains were at K instants."""
+    """Where trains were at K instants on n ways: one for each train, and one more whenever it turns back."""
 
     time: np.ndarray  # (K,) s
-    along: np.ndarray  # (K, n) m, front, from the beginning of the train's way
+    along: np.ndarray  # (K, n) m, front, from the beginning of the way
     speed: np.ndarray  # (K, n) m/s, of the front
     minimum: np.ndarray  # (K, n) m/s, of the slowest unit
-    present: np.ndarray  # (K, n)
-    ways: list[np.ndarray]  # edges of every train's way
+    present: np.ndarray  # (K, n) whether the train is on that way
+    ways: list[np.ndarray]  # edges of every way
+    who: np.ndarray  # (n,) whose way it is
 
 
 class Findings(NamedTuple):
@@ -51,6 +52,8 @@ class Recording:
     def __init__(self, p: Model) -> None:
         self.p = p
         self.rows: list[tuple[Any, ...]] = []
+        self.legs: list[np.ndarray] = []
+        self.ways: dict[tuple[int, int], np.ndarray] = {}  # of every train and leg, as it was in the end
 
     def look(self, sim: Any) -> None:
         """Write down where the fronts are, as the world measures it."""
@@ -58,13 +61,22 @@ class Recording:
         own, leading = sim.state.own, self.p.leading
         along = seen.position - ways.begin[ways.first[:-1]]
         minimum = np.minimum.reduceat(own[:, 1], leading)
-        there = seen.present & ~sim.state.traffic.parked  # who is parked stands beside the track
+        parked = sim.state.traffic.parked  # who is parked stands beside the track
+        there = seen.present & ~parked
+        if self.rows:  # SUMO's own trains leave it with the step in which they stop; the program knows a step later
+            self.rows[-1][-1][:] &= ~(parked & self.p.roster.driven)
         self.rows.append((sim.time, along, own[leading, 1].copy(), minimum, there))
-        self.ways = [ways.edge[a:b].copy() for a, b in zip(ways.first[:-1], ways.first[1:], strict=True)]
+        self.legs.append(sim.state.traffic.leg.copy())
+        for i, leg in enumerate(self.legs[-1].tolist()):
+            self.ways[i, leg] = ways.edge[ways.first[i] : ways.first[i + 1]].copy()
 
     def tracks(self) -> Tracks:
         """All of it."""
-        return Tracks(*(np.array(column) for column in zip(*self.rows, strict=True)), self.ways)
+        time, along, speed, minimum, present = (np.array(column) for column in zip(*self.rows, strict=True))
+        who, leg = np.array(sorted(self.ways)).T
+        on = np.array(self.legs)[:, who] == leg
+        ways = [self.ways[key] for key in sorted(self.ways)]
+        return Tracks(time, along[:, who], speed[:, who], minimum[:, who], present[:, who] & on, ways, who)
 
 
 def judge(p: Model, tracks: Tracks) -> Findings:
@@ -97,7 +109,7 @@ def bodies(p: Model, tracks: Tracks, frames: np.ndarray, present: np.ndarray) ->
 
     ``frames`` (F, n) are places of the fronts along the ways.
     """
-    rails, lengths, parts = p.rails, p.consists.train_length(), []
+    rails, lengths, parts = p.rails, p.consists.train_length()[tracks.who], []
     for i, way in enumerate(tracks.ways):
         edges, begins = laid(p, way, float(lengths[i]))
         front = frames[:, i, None]
@@ -114,7 +126,7 @@ def bodies(p: Model, tracks: Tracks, frames: np.ndarray, present: np.ndarray) ->
 
 def overlap(p: Model, tracks: Tracks) -> str | None:
     """The deepest overlap of two bodies, or of two on tracks that cross, with its first instant."""
-    n, lengths = len(tracks.ways), p.consists.train_length()
+    n, lengths, who = len(tracks.ways), p.consists.train_length(), tracks.who
     if n < 2 or len(tracks.time) < 2:
         return None
     moved = np.abs(np.diff(tracks.along, axis=0))[tracks.present[1:] & tracks.present[:-1]]
@@ -125,7 +137,8 @@ def overlap(p: Model, tracks: Tracks) -> str | None:
     here = np.repeat(tracks.present[:-1] & tracks.present[1:], looks, axis=0)
     here[::looks] = tracks.present[:-1]
     frames, here = np.vstack([between, tracks.along[-1:]]), np.vstack([here, tracks.present[-1:]])
-    frame, train, edge, low, high = bodies(p, tracks, frames, here)
+    frame, way, edge, low, high = bodies(p, tracks, frames, here)
+    train = who[way]
     edges = len(p.rails.edges)
     key = frame * edges + edge
     order = np.lexsort((low, key))
@@ -171,16 +184,17 @@ def overspeed(p: Model, tracks: Tracks) -> str | None:
     for since, edge, speed in zip(*p.signs, strict=True):
         shown[tracks.time >= since - 1e-9, edge] = speed
     for i, way in enumerate(tracks.ways):
-        if p.roster.driven[i]:  # by SUMO, as its type says
+        train = int(tracks.who[i])
+        if p.roster.driven[train]:  # by SUMO, as its type says
             continue
         begins = np.concatenate([[0.0], np.cumsum(p.rails.length_m[way])])
         front = tracks.along[:, i, None]
-        under = (begins[:-1] < front - TOUCH_M) & (begins[1:] > front - p.consists.train_length()[i] + TOUCH_M)
-        limit = np.min(np.where(under, p.roster.speed_factor[i] * shown[:, way], np.inf), axis=1)
+        under = (begins[:-1] < front - TOUCH_M) & (begins[1:] > front - p.consists.train_length()[train] + TOUCH_M)
+        limit = np.min(np.where(under, p.roster.speed_factor[train] * shown[:, way], np.inf), axis=1)
         excess = np.where(tracks.present[:, i], tracks.speed[:, i] - limit, -np.inf)
         k = int(np.argmax(excess))
         if excess[k] > worst[0]:
-            words = f"{p.scenario.ids[i]} with {tracks.speed[k, i]:.3f} m/s at {tracks.time[k]:g} s, limit {limit[k]:g}"
+            words = f"{p.scenario.ids[train]} with {tracks.speed[k, i]:.3f} m/s at {tracks.time[k]:g} s, limit {limit[k]:g}"
             worst = (float(excess[k]), words)
     return worst[1] or None
 
@@ -195,5 +209,5 @@ def backwards(p: Model, tracks: Tracks) -> str | None:
     ):
         if broken.any():
             k, i = (int(x) for x in np.argwhere(broken)[0])
-            return f"{ids[i]} backwards at {tracks.time[k]:g} s ({what}: {value[k, i]:.4g})"
+            return f"{ids[tracks.who[i]]} backwards at {tracks.time[k]:g} s ({what}: {value[k, i]:.4g})"
     return None

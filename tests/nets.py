@@ -239,22 +239,26 @@ def single_track(folder: Path, body: str, signals: Collection[str] = ()) -> None
 UP, DOWN = "left up1 middle up2 right", "-right down2 -middle down1 -left"
 
 
-def terminals(folder: Path, body: str, *options: str, scale: float = 1.0, **more: Any) -> None:
+def terminals(
+    folder: Path, body: str, *options: str, scale: float = 1.0, signals: Collection[str] = (), **more: Any
+) -> None:  # fmt: skip
     """Single track from a terminal ``a`` over ``b``, where a branch to ``d`` leaves it, to one in ``c``; trains turn back in each."""
     nodes = {
         name: (scale * x, scale * y) for name, (x, y) in {"a": (0, 0), "b": (4000, 0), "c": (7000, 0), "d": (6500, 900)}.items()
     }
-    net(folder, nodes, {**both_ways("ab", "a", "b"), **both_ways("bc", "b", "c"), **both_ways("bd", "b", "d")}, TERMINALS, *options)
+    edges = {**both_ways("ab", "a", "b"), **both_ways("bc", "b", "c"), **both_ways("bd", "b", "d")}
+    net(folder, nodes, edges, TERMINALS, *options, signals=signals)
     traffic(folder, body, **more)
 
 
-def platforms(folder: Path, body: str) -> None:
+def platforms(folder: Path, body: str, signals: Collection[str] = ()) -> None:
     """A double track, ``up`` and ``down``, that ends in a terminal of two platforms, ``p1`` and ``p2``, in which trains turn back."""
     net(
         folder,
         {"a": (0, 0), "z": (0, -40), "s": (9000, 0), "t1": (10000, 40), "t2": (10000, -40)},
         {"up": ("a", "s"), "down": ("s", "z"), **both_ways("p1", "s", "t1"), **both_ways("p2", "s", "t2")},
         TERMINALS,
+        signals=signals,
     )
     traffic(folder, body)
 

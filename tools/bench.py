@@ -18,7 +18,7 @@ finite_time        numeric: ``emu_finite_time`` on the same trains
 actuated_units     numeric: ``fault_tolerant`` with its observer on trains of four units with actuators
 supervised         numeric: the loop under the supervisor
 traffic            numeric: trains that come from two lines each, form up where these merge, and are supervised
-ignoring           in SUMO: trains on the same lines, with a signal every 2 km, that nobody obeys
+ignoring           in SUMO: trains on the same lines, with a signal every 2 km, that is not obeyed
 obeying            the same trains obey the signals; less ``ignoring``, it is what obeying costs
 =================  ===============================================================================================================
 
@@ -454,7 +454,7 @@ def closed(folder: Path, case: str) -> Case:
     world: Any = open_world(model, folder, "sumo" if case in (*IN_SUMO, *SIGNALLED) else "numeric")
     loop = Loop(model, world, journal)
     loop.step()  # compiles or loads what the kernels need
-    clock.around(loop, "_measured", "read")
+    clock.around(loop, "measured", "read")
     clock.around(loop.topology, "step", "topology")
     clock.around(loop.control, "step", "control")
     clock.around(loop.plant, "step", "plant")

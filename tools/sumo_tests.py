@@ -41,7 +41,7 @@ from sumo_net.build import program
 from trainctl.errors import InputError
 from trainctl.scenario.starter import starter
 
-#: Nobody is waited for longer [s]: in the simulation, and for a run to end.
+#: No run is waited for longer [s]: in the simulation, and for a run to end.
 END_S, PATIENCE_S = 6000.0, 600.0
 
 
@@ -133,7 +133,7 @@ def case(sumocfg: Path, base: Path) -> dict[str, Any]:
             return found | {"law": {"ran": f"exit 2: {why}"}, "baseline": {"ran": f"exit 2: {why}"}}
         begin = re.search(r'<(?:begin|b) (?:value|v)="([\d.]+)"', sumocfg.read_text(encoding="utf-8"))
         since = float(begin[1]) if begin else 0.0
-        end = max((t for t, _ in there.arrived), default=0.0) - since + 10.0
+        end = 1.2 * (max((t for t, _ in there.arrived), default=0.0) - since) + 300.0  # drivers brake with half the deceleration
         if end > tomllib.loads(scenario.read_text(encoding="utf-8"))["run"]["duration_s"]:  # SUMO itself is slower than thought
             longer = re.sub(r"(?m)^duration_s = \d+", f"duration_s = {math.ceil(end)}", scenario.read_text(encoding="utf-8"))
             scenario.write_text(longer, encoding="utf-8")

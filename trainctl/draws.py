@@ -63,7 +63,7 @@ def _drawn(seed: int, purpose: int, count: Ints, who: Ints, gaussian: bool) -> F
 
 @njit(cache=True)
 def _fill(key_low: int, key_high: int, purpose: int, count: Ints, who: Ints, gaussian: bool, out: Floats) -> None:
-    """Write the numbers of every count and everybody into ``out`` (k, m)."""
+    """Write the numbers of every count and every train into ``out`` (k, m)."""
     for r in range(len(count)):
         for i in range(len(who)):
             first, second = uniforms(count[r], purpose, who[i, 0], who[i, 1], key_low, key_high)

@@ -171,6 +171,9 @@ class Served:
         """Say that a train stands at a stop of its own, or goes on."""
         self.world.halt(int(self.trains[train]), stands)
 
+    def claim(self, claims: list[list[int]]) -> None:
+        """Where signals are obeyed a roster is not divided."""
+
     def turn(self, train: int, edges: tuple[str, ...], arrival: float) -> None:
         """Let a train turn back with the next move."""
         self.world.turn(int(self.trains[train]), edges, arrival)

@@ -44,7 +44,7 @@ Index._load_index = _load_index
 def _base() -> Path:
     """A folder for kernels that can be written: the user's cache, else one in the folder for temporary files.
 
-    What is kept there is run, so a folder that somebody else could have written into is not taken.
+    What is kept there is run, so a folder that others could have written into is not used.
     """
     try:
         places = [Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "trainctl"]

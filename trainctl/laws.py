@@ -109,10 +109,10 @@ PARTS = {
 
 
 def _complete(name: str, load: Any) -> Any:
-    """Somebody else's law, if it can be imported and has all its parts."""
+    """A law from elsewhere, if it can be imported and has all its parts."""
     try:
         module = load()
-    except Exception as error:  # whatever somebody else's module raises
+    except Exception as error:  # whatever a module from elsewhere raises
         lines = traceback.extract_tb(error.__traceback__)
         where = f" (line {error.lineno})" if isinstance(error, SyntaxError) else f" ({lines[-1].name}, line {lines[-1].lineno})"
         raise InputError(f"controller.law = {name}: cannot be imported: {type(error).__name__}: {error}{where}") from None

@@ -75,17 +75,20 @@ class Numeric:
         self.coming.append(train)
 
     def park(self, train: int, off: bool) -> None:
-        """It stays where it stands: nobody here is in anybody's way."""
+        """It stays where it stands: here no train is in the way of another."""
 
     def turn(self, train: int, edges: tuple[str, ...], arrival: float) -> None:
         """Let a train turn back with the next move."""
         self.turning.append((train, edges, arrival))
 
     def halt(self, train: int, stands: bool) -> None:
-        """Nobody sets signals here."""
+        """No signals are set here."""
+
+    def claim(self, claims: list[list[int]]) -> None:
+        """Nor here."""
 
     def linked(self, links: Links, formation: Ints) -> None:
-        """Nobody looks."""
+        """Nothing is shown."""
 
     def move(self, displacement: Floats, step: float) -> None:
         """Move every train; as in SUMO one on the very end of an edge is still on it, and one near the end of its way is gone."""

@@ -41,7 +41,7 @@ def golden_run(request: pytest.FixtureRequest) -> GoldenRun:
     """``golden_run(run, name, tolerances=None, every_s=60.0)``: assert that a run or log matches ``goldens/NAME`` beside the test.
 
     With ``--force-regen`` a golden that is missing or does not match is written anew, and the test fails with what moved, so that
-    nobody renews one without noticing.
+    none is renewed unnoticed.
     """
 
     def check(

@@ -54,7 +54,7 @@ class Watched(Steps):
     def __init__(self, model: Model, world: SelfDriven, journal: record.Journal) -> None:
         super().__init__(model, journal)
         p, self.world = model, world
-        # Nobody but the simulator protects these trains: their switches are locked within its braking distance.
+        # Only the simulator protects these trains: their switches are locked within its braking distance.
         self.rate = rate = p.law.braking_mps2(p.params)
         protected = supervisor.Params(mode="on", service_mps2=rate, emergency_mps2=rate)
         ruled = replace(p, scenario=p.scenario.model_copy(update={"supervisor": protected}))

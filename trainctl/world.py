@@ -20,6 +20,9 @@ class SignalBox(Protocol):
     def blocker(self, signal: int) -> int:
         """A train because of which a signal is red, -1 if none is known."""
 
+    def kept_parked(self) -> list[int]:
+        """Trains that were to come back to their tracks with the last move, and found no place: they are parked still."""
+
     def speeds(self) -> Floats:
         """Speed of every train that it drives itself [m/s], shape (n,), NaN for the others."""
 
@@ -33,7 +36,7 @@ class World(Protocol):
 
     @property
     def box(self) -> SignalBox | None:
-        """Who sets the signals; None: nobody obeys any."""
+        """What sets the signals; None: none are obeyed."""
 
     def start(self, start: Start) -> None:
         """Put the trains on the line; afterwards ``measure`` gives their initial positions."""
@@ -48,10 +51,16 @@ class World(Protocol):
         """Put a train on the net where it was to start; it is there after the next ``move``, or signals keep it out."""
 
     def park(self, train: int, off: bool) -> None:
-        """Take a train that stands off its track, or put it back: both come with the next ``move``, in which it stands."""
+        """Take a train that stands off its track, or put it back: both come with the next ``move``, in which it stands.
+
+        Where signals are obeyed it may not be let back, see ``SignalBox.kept_parked``; then it is to be told again.
+        """
 
     def halt(self, train: int, stands: bool) -> None:
         """Say that a train stands at a stop of its own, or goes on: where signals are obeyed, it asks for none meanwhile."""
+
+    def claim(self, claims: list[list[int]]) -> None:
+        """Say which trains hold which signals from now on, as pairs of train and signal: nobody else gets what they need there."""
 
     def turn(self, train: int, edges: tuple[str, ...], arrival: float) -> None:
         """Let a train that stands turn back with the next ``move``, in which it stands: its rear becomes its front.
@@ -93,7 +102,7 @@ class SelfDriven(Protocol):
 
     @property
     def over(self) -> bool:
-        """Whether every train has left, and nobody is still to come."""
+        """Whether every train has left, and none is still to come."""
 
     def start(self) -> None:
         """Let the first trains in; afterwards ``measure`` gives the state at time 0."""

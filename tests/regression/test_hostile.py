@@ -1,6 +1,7 @@
 """No law causes a collision where the supervisor is on; without it the same laws collide in most runs.
 
-There are rows of trains on lines and nets (``hostile``), and traffic with all that files and orders may ask (``hostile_traffic``).
+There are rows of trains on lines and nets (``hostile``), and traffic with all that files and orders may ask, with trains that turn
+back, and with signals (``hostile_traffic``). Runs that were broken off go on to the byte.
 
 A case that fails is kept: its folder has the scenario, its line or net and its law, and the message says how to run it.
 """
@@ -28,15 +29,22 @@ ALWAYS = (0, 5, 6, 10, 13, 14, 15, 17, 18, 19, 21, 23, 25, 27, 29, 34, 38, 40, 4
 ALWAYS_OFF, ALWAYS_SUMO = range(16), (0, 10, 17)
 
 #: The same in traffic, where most railways are busy only at times.
-TRAFFIC_ALWAYS, TRAFFIC_ALWAYS_OFF, TRAFFIC_ALWAYS_SUMO = (
-    range(8),
-    (0, 1, 3, 7),
-    ((2, hostile_traffic.drawn), (9, hostile_traffic.signalled)),
-)
+TRAFFIC_ALWAYS, TRAFFIC_ALWAYS_OFF, REVERSING_ALWAYS = range(8), (0, 1, 3, 7), (4, 5, 13, 22)
+TRAFFIC_ALWAYS_SUMO = (
+    (2, hostile_traffic.drawn), (5, hostile_traffic.reversing), (9, hostile_traffic.signalled), (15, hostile_traffic.signalled),
+    (28, hostile_traffic.signalled),
+)  # fmt: skip
+
+
+def parts(begin: int, end: int, size: int) -> list[range]:
+    """Seeds of the campaign in parts that take some minutes each."""
+    return [range(a, min(a + size, end)) for a in range(begin, end, size)]
+
 
 #: Seeds of the campaign. Those of SUMO are others, and as many run with the supervisor off.
-CAMPAIGN, CAMPAIGN_SUMO, CAMPAIGN_OFF = range(10_000, 13_000), range(20_000, 20_200), range(10_000, 10_300)
-TRAFFIC, TRAFFIC_SUMO, TRAFFIC_OFF = range(10_000, 11_000), range(20_000, 20_100), range(10_000, 10_100)
+CAMPAIGN, CAMPAIGN_SUMO, CAMPAIGN_OFF = parts(10_000, 13_000, 500), parts(20_000, 20_200, 100), range(10_000, 10_300)
+TRAFFIC, REVERSING, TRAFFIC_OFF = parts(10_000, 11_000, 250), parts(10_000, 10_400, 200), range(10_000, 10_100)
+TRAFFIC_SUMO, RESUMED = range(20_000, 20_100), range(30_000, 30_012)
 
 PROCESSES = 2
 
@@ -114,6 +122,25 @@ def test_in_sumo_neither_in_traffic(tmp_path):
     harmless([one(tmp_path, draws, hostile.QUICK, "on", "sumo", seed) for seed, draws in TRAFFIC_ALWAYS_SUMO], "sumo")
 
 
+def test_no_law_causes_a_collision_where_trains_turn_back(tmp_path):
+    harmless(
+        [one(tmp_path, hostile_traffic.reversing, hostile.QUICK, "on", "numeric", seed) for seed in REVERSING_ALWAYS], "numeric"
+    )
+
+
+#: Which runs are broken off, and on what.
+RESUMES = {
+    "traffic": (hostile_traffic.drawn, "numeric"), "reversing": (hostile_traffic.reversing, "numeric"),
+    "reversing in sumo": (hostile_traffic.reversing, "sumo"), "signalled": (hostile_traffic.signalled, "sumo"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("draws, backend", [RESUMES[key] for key in ("reversing", "signalled")], ids=["reversing", "signalled"])
+def test_a_hostile_run_resumes_to_the_byte(draws, backend, tmp_path):
+    for seed in (4, 5):
+        assert hostile_traffic.resumed(draws(seed, tmp_path, hostile.QUICK), backend, 0.6) == []
+
+
 @wild
 def test_without_the_supervisor_these_collide_in_traffic(tmp_path):
     reports = [one(tmp_path, hostile_traffic.drawn, hostile.QUICK, "off", "numeric", seed) for seed in TRAFFIC_ALWAYS_OFF]
@@ -153,19 +180,37 @@ def campaign(title: str, seeds: range, place: Path, draws: Draws, mode: str, bac
 
 
 @pytest.mark.campaign
-def test_three_thousand_runs(tmp_path):
-    harmless(campaign("on", CAMPAIGN, tmp_path, hostile.drawn, "on", "numeric"), "numeric")
+@pytest.mark.parametrize("seeds", CAMPAIGN, ids=str)
+def test_three_thousand_runs(seeds, tmp_path):
+    harmless(campaign("on", seeds, tmp_path, hostile.drawn, "on", "numeric"), "numeric")
 
 
 @pytest.mark.campaign
-def test_a_thousand_runs_in_traffic(tmp_path):
-    harmless(campaign("traffic", TRAFFIC, tmp_path, hostile_traffic.drawn, "on", "numeric"), "numeric")
+@pytest.mark.parametrize("seeds", TRAFFIC, ids=str)
+def test_a_thousand_runs_in_traffic(seeds, tmp_path):
+    harmless(campaign("traffic", seeds, tmp_path, hostile_traffic.drawn, "on", "numeric"), "numeric")
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("seeds", REVERSING, ids=str)
+def test_hundreds_of_runs_in_traffic_that_turns_back(seeds, tmp_path):
+    harmless(campaign("turning", seeds, tmp_path, hostile_traffic.reversing, "on", "numeric"), "numeric")
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("draws, backend", RESUMES.values(), ids=RESUMES)
+def test_dozens_of_runs_in_traffic_resume_to_the_byte(draws, backend, tmp_path):
+    cases = [draws(seed, tmp_path, hostile.PLANTS) for seed in RESUMED]
+    found = {case.seed: hostile_traffic.resumed(case, backend, 0.2 + 0.06 * k) for k, case in enumerate(cases)}
+    assert not any(found.values()), found
+    assert list(found.values()).count(None) < 0.5 * len(found)
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("seeds, draws", [
-    (CAMPAIGN_SUMO, hostile.drawn), (TRAFFIC_SUMO, hostile_traffic.drawn), (TRAFFIC_SUMO, hostile_traffic.signalled),
-])  # fmt: skip
+    *((seeds, hostile.drawn) for seeds in CAMPAIGN_SUMO), (TRAFFIC_SUMO, hostile_traffic.drawn),
+    (TRAFFIC_SUMO, hostile_traffic.signalled), (TRAFFIC_SUMO, hostile_traffic.reversing),
+], ids=["a", "b", "traffic", "signalled", "reversing"])  # fmt: skip
 def test_hundreds_of_runs_in_sumo(seeds, draws, tmp_path):
     harmless(campaign("SUMO", seeds, tmp_path, draws, "on", "sumo"), "sumo")
 

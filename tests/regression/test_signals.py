@@ -16,6 +16,7 @@ from trainctl.errors import InputError
 from trainctl.runner import opened, resume, run
 from trainctl.runs.run import Run
 from trainctl.scenario.build import open_scenario
+from trainctl.sumo.signal_box import Box
 
 #: What must never be told of trains that obey.
 AMISS = ("violation", "red_passed", "green_withdrawn", "gridlock", "sumo_warning", "not_entered")
@@ -328,3 +329,34 @@ def test_trains_turn_back_where_signals_are_obeyed_ours_and_those_of_sumo(tmp_pa
     assert set(at(found, "arrive")) == {"v", "w"} and not amiss(found) and found.ok
     assert sum(e["kind"] == "turn" for e in found.events) == turns  # SUMO's turn without a word
     assert sum(e["kind"] == "stop_left" for e in found.events) == 2 == len(found.stops.dropna(subset=["departure_s"]))
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_a_green_that_can_no_longer_be_given_up_is_not_taken_back(tmp_path, monkeypatch, held):
+    """With long steps SUMO thinks that a train can still stop that cannot, and prefers another one that comes to be earlier."""
+    if not held:
+        monkeypatch.setattr(Box, "hold", lambda self: None)
+    join(tmp_path, nets.train("ours", WEST, 0) + nets.train("sumo", SOUTH, 130, departSpeed=0))
+    made = nets.scenario(
+        "robust_constrained", 1600, run={"step_s": 10.0}, controller={"h_per_s": 0.05}, reference={"speed_mps": 15.0},
+        traffic={"cooperate": ["ours"], "others": "sumo"},
+    )  # fmt: skip
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(made))
+    found = run(open_scenario(str(tmp_path / "s.toml")), tmp_path / "out")
+    told = [e["kind"] for e in found.events if e["kind"] in ("green_withdrawn", "red_passed", "violation")]
+    assert told == ([] if held else ["green_withdrawn", "red_passed"])
+    if held:  # and whoever was held for it goes on
+        assert passed(found, "ours", "main") < passed(found, "sumo", "main")
+        assert order_of(at(found, "arrive")) == ["ours", "sumo"]
+
+
+def test_a_parked_train_that_sumo_does_not_let_back_waits_and_says_so(tmp_path):
+    """Its block is taken by a train of SUMO's that has come by meanwhile."""
+    halt = '<stop lane="west_0" endPos="1000" duration="40" parking="true"/>'
+    join(tmp_path, nets.train("ours", WEST, 0, halt) + nets.train("sumo", WEST, 20, maxSpeed=25))
+    found = ran(tmp_path, 900, cooperate=["ours"], others="sumo", wait_limit_s=20.0)
+    left, reached = at(found, "stop_left")["ours"], at(found, "stop_reached")["ours"]
+    (waits,) = (e for e in found.events if e["kind"] == "waiting" and e["train"] == "ours")
+    assert waits["place"] == "parked" and waits["other"] is None and waits["time_s"] > waits["since_s"] + 20.0 > reached + 60.0
+    assert passed(found, "sumo", "main") < left < passed(found, "sumo", "main") + 30.0 and left > reached + 60.0
+    assert not amiss(found) and found.ok and order_of(at(found, "arrive")) == ["sumo", "ours"]

@@ -200,6 +200,69 @@ def test_a_train_turns_with_a_junction_under_it(tmp_path):
     assert turned["time_s"] == left["time_s"] and str(rows.edge[turned["time_s"] + 1.0]) == "-bc"
 
 
+@pytest.mark.parametrize(("said", "length"), [('duration="10"', 700.0), ('speed="5"', 100.0), ('speed="5"', 700.0)])
+def test_a_stop_beyond_where_it_may_turn_is_made_where_it_may(said, length, tmp_path):
+    """At the very end of an edge, with a junction under the train or not, and for a place it only passes."""
+    nodes = {"a": (0, 0), "b": (1500, 0), "c": (2500, 0), "d": (3000, 0)}
+    edges = {**nets.both_ways("ab", "a", "b"), **nets.both_ways("bc", "b", "c"), **nets.both_ways("cd", "c", "d")}
+    nets.net(tmp_path, nodes | {"x": (2000, 500)}, edges | nets.both_ways("xc", "x", "c"), nets.TERMINALS)
+    types = nets.EMU.replace('length="100"', f'length="{length}"')
+    nets.traffic(tmp_path, nets.train("v", "ab bc cd -cd -bc -ab", 0, f'<stop lane="cd_0" {said}/>'), types)
+    kind = nets.LAWS["robust_constrained"]["train_type"] | {"unit_length_m": length}
+    found = both(opened_in(tmp_path, "robust_constrained", 300, train_type={"emu": kind}), tmp_path)
+    [reached], [turned], [_] = (told(found, kind) for kind in ("stop_reached" if "dur" in said else "waypoint", "turn", "arrive"))
+    assert 80.0 < reached["time_s"] < turned["time_s"] < 140.0
+    assert reached.get("short_m", 0.0) == pytest.approx(0.0 if "speed" in said or length == 100.0 else 7.34, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("net", "others"),
+    [
+        ("platforms", "driven"),
+        ("terminals", "sumo"),
+        pytest.param("terminals", "driven", marks=pytest.mark.campaign),
+        pytest.param("platforms", "sumo", marks=pytest.mark.campaign),
+    ],
+)
+def test_signals_let_trains_turn_one_after_the_other_as_in_plain_sumo(net, others, tmp_path):
+    """Two shuttles on one track, and five trains into a terminal of two platforms; with trains of SUMO's own among them."""
+    if net == "terminals":
+        ways = {name: f"ab {e} -{e} -ab ab {e} -{e} -ab" for name, e in (("A", "bc"), ("B", "bd"))}
+        stops = {name: halts(e, "-ab", e, duration=10) for name, e in (("A", "bc"), ("B", "bd"))}
+    else:
+        ways = {f"t{k}": f"up p{k % 2 + 1} -p{k % 2 + 1} down" for k in range(5)}
+        stops = {f"t{k}": halts(f"p{k % 2 + 1}", duration=5) for k in range(5)}
+    body = "".join(nets.train(name, ways[name], 60 * k, stops[name]) for k, name in enumerate(ways))
+    if net == "terminals":
+        nets.terminals(tmp_path, body, scale=0.5, signals="b")
+    else:
+        nets.platforms(tmp_path, body, signals="s")
+    ours = list(ways) if others == "driven" else list(ways)[1:2]
+    p = opened_in(
+        tmp_path,
+        "robust_constrained",
+        2000,
+        traffic={"signals": "obey", "others": others, "cooperate": ours, "below_limit_mps": 0.0},
+    )
+    with opened(p, tmp_path / "out") as sim:
+        while not sim.over:
+            sim.step()
+            bodies = under(p, sim) if others == "driven" else []
+            for i, e, a, b in bodies:
+                assert not [(i, j) for j, f, c, d in bodies if j != i and f == e and min(b, d) - max(a, c) > 1e-6], sim.time
+        sim.end()
+    found = Run(tmp_path / "out")
+    assert not [e for e in found.events if e["kind"] in ("violation", "sumo_warning", "gridlock", "red_passed", "green_withdrawn")]
+    theirs = {row["id"]: float(row["arrival"]) for row in plain(tmp_path, "tripinfo")}
+    stops_made = sorted(e["train"] for e in told(found, "stop_reached"))
+    assert stops_made == sorted(row["id"] for row in plain(tmp_path, "stop"))
+    here = {e["train"]: e["time_s"] for e in told(found, "arrive")}
+    assert sorted(here, key=here.__getitem__) == sorted(theirs, key=theirs.__getitem__)
+    assert len(told(found, "turn")) == sum(stops[name].count("<stop") for name in ours)
+    held = told(found, "signal")
+    assert (held or others == "sumo") and all(e["other"] not in (None, e["train"]) for e in held)
+
+
 def test_a_train_with_its_rear_inside_a_junction_goes_on_before_it_turns(tmp_path):
     stop = '<stop lane="bc_0" endPos="98" duration="10"/>'
     nets.terminals(tmp_path, nets.train("v", "ab bc -bc -ab", 0, stop), scale=0.25)

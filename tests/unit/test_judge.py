@@ -25,7 +25,7 @@ def tracks(p, along, speed=0.0, step=1.0):
     place = np.array(along, float)
     speeds = np.full(place.shape, speed)
     ways = [np.array([p.rails.index[e] for e in route]) for route in p.roster.routes]
-    return Tracks(np.arange(len(place)) * step, place, speeds, speeds, np.ones(place.shape, bool), ways)
+    return Tracks(np.arange(len(place)) * step, place, speeds, speeds, np.ones(place.shape, bool), ways, np.arange(len(ways)))
 
 
 @pytest.mark.parametrize(("front", "overlaps"), [(400.0, False), (400.5, True), (450.0, True), (520.0, True), (600.5, False)])
@@ -50,6 +50,22 @@ def test_across_the_end_of_an_edge(tmp_path):
     at = float(p.rails.length_m[p.rails.index["ab"]])
     assert judge(p, tracks(p, [[at + 50.0, at - 40.0]] * 2)).overlap
     assert judge(p, tracks(p, [[at + 50.0, at - 60.0]] * 2)).overlap is None
+
+
+@pytest.mark.parametrize(("apart", "overlaps"), [(1.0, False), (-1.0, True)])
+def test_a_train_that_turned_lies_where_it_lay_and_not_on_itself(tmp_path, apart, overlaps):
+    nets.terminals(tmp_path, "")
+    p = prepared(tmp_path, "ab bc", "ab bc")
+    size = float(p.rails.length_m[p.rails.index["bc"]])
+    begin = sum(float(p.rails.length_m[e]) for e in p.rails.way(["ab", "bc"])[:-1])
+    out, back = (np.array(p.rails.way([edge])) for edge in ("bc", "-bc"))
+    # the first one stands with 100 m .. 200 m of bc under it, and turns; the other one is behind it then
+    along = np.array([[200.0, size - 100.0, begin + 100.0 - apart]] * 2)
+    present = np.array([[True, False, True], [False, True, True]])
+    speeds = np.zeros(along.shape)
+    other = np.array(p.rails.way(["ab", "bc"]))
+    found = judge(p, Tracks(np.arange(2.0), along, speeds, speeds, present, [out, back, other], np.array([0, 0, 1])))
+    assert bool(found.overlap) is overlaps and found.backwards is None
 
 
 @pytest.mark.parametrize(("apart", "overlaps"), [(1.0, False), (-1.0, True)])

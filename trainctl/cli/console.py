@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 DEFAULT_SCENARIO = "three_tracks"
 
-#: Columns that a table may take where nobody reads it on a screen: what it needs, no cell is wrapped.
+#: Columns that a table may take where it is not read on a screen: what it needs, no cell is wrapped.
 PIPED = 1000
 
 #: Smaller numbers are shown as 0.

@@ -130,6 +130,8 @@ def compare(
 
     `trainctl compare suite` runs every law in every situation (join, leave, stop, emergency stop, outage, bursts, gradient, unit
     lost), 20 times each, into one table and one page.
+
+    Of finished runs nothing is executed. With --controllers laws run: A law that is a file is a program: it is executed.
     """
     from trainctl.cli.console import listing, show, show_json
     from trainctl.runs.run import Run

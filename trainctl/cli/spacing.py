@@ -51,7 +51,7 @@ def spacing(
     show(printed)
     for name, value in lines.items():
         say(f"{name} braking distance: {value:.4g} m")
-    for words in shown.reasons(table):
+    for words in [*shown.sumo_lines(table), *shown.reasons(table)]:
         say(words)
     for path in [*pictures, tex]:
         say(path)

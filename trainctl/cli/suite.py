@@ -36,6 +36,7 @@ def suite(
     for row in names:
         fill(table, row.replace("_", " "), *(shown.words(known[row, name]) for name in situations))
     show(table)
+    say(shown.confirmed(cells))
     for cell in cells:
         if cell["why"]:
             say(f"{cell['row']}, {cell['situation']}: {cell['why']}".replace("_", " "))

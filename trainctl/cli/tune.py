@@ -47,6 +47,8 @@ def register(app: typer.Typer) -> None:
 
         OUT gets tuned.toml (the scenario with the best gains), search.parquet and search.png (all candidates), and tune.json.
         Exit 1 if no candidate kept all bounds.
+
+        A law that is a file is a program: it is executed.
         """
         from trainctl.cli.console import show_json
         from trainctl.studies import sweep as sweeping

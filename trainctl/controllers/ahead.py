@@ -24,11 +24,12 @@ from trainctl.signals import POSITION, SPEED, Bools, Bounds, Floats, Ints, Links
 #: A reference slower than this does not tell the time [m/s].
 STANDS_MPS = 0.1
 
-#: Speed feedback of a train that follows nobody, and of all below the maximum speed [1/s].
-CRUISE_PER_S = 0.1
+#: Speed feedback of a train that follows none, and of all below the maximum speed [1/s]: while it is slower than it wants, and
+#: faster, so that unknown forces do not take it past the maximum; the second is less with long control periods.
+CRUISE_PER_S, TOO_FAST_PER_S = 0.1, 0.5
 
 #: Share of the room between the speed of the reference and the maximum speed that closing up may use.
-ROOM_TO_CLOSE_UP = 0.75
+ROOM_TO_CLOSE_UP = 0.6
 
 #: Columns of a message.
 PLACE, SAID_SPEED, SAID_ACCELERATION, SAID_REFERENCE, SAID_BRAKING, SAID = range(6)
@@ -93,16 +94,17 @@ def seen(who: Followed, own: Trains, leader: Floats, links: Links, heard: Floats
     )  # fmt: skip
 
 
-def cruising(own: Trains, leader: Floats, follows: Bools, faster: float, upper: Floats) -> Floats:
-    """Acceleration that takes a train to the reference's speed; one that follows somebody to at most ``faster`` above it.
+def cruising(own: Trains, leader: Floats, follows: Bools, faster: float, upper: Floats, period: float) -> Floats:
+    """Acceleration that takes a train to the reference's speed; one that follows another to at most ``faster`` above it.
 
-    A part of the room below the maximum speed ``upper`` (n,) [m/s] is left for what disturbs.
+    A part of the room below the maximum speed ``upper`` (n,) [m/s] is left for what disturbs. ``period`` is the control period [s].
     """
     n = len(own.speed)
     reference = np.broadcast_to(leader[SPEED], n)
     room = ROOM_TO_CLOSE_UP * np.maximum(upper - reference, 0.0)
     speed = np.minimum(reference, upper) + np.where(follows, np.minimum(faster, room), 0.0)
-    wanted: Floats = np.broadcast_to(leader[2], n) + CRUISE_PER_S * (speed - own.speed)
+    gain = np.where(own.speed > speed, max(min(TOO_FAST_PER_S, 0.5 / period), CRUISE_PER_S), CRUISE_PER_S)
+    wanted: Floats = np.broadcast_to(leader[2], n) + gain * (speed - own.speed)
     return wanted
 
 
@@ -144,7 +146,7 @@ def named(scene: Scene, who: Followed, i: int) -> str:
 
 
 def braking_violations(scene: Scene, brakes: Floats, key: str) -> Iterator[str]:
-    """Trains whose braking nobody states."""
+    """Trains whose braking is not stated."""
     for i in np.flatnonzero(~np.isfinite(brakes)).tolist():
         yield (f"{key}: missing; train {scene.trains[i]} has neither braking_n nor an input bound from which its braking follows")
 

@@ -61,8 +61,8 @@ COMPARED: dict[str, dict[str, Any]] = {"emu_finite_time": {"alpha_1": 0.9}, "ord
 
 #: What a train is told in `trainctl compare spacing`, and why its spacing is what it is there.
 IN_STOPS = (
-    "heads and tails of neighbours. The reference pulls on at its speed; the barrier acts in the emergency zone "
-    "alone, a part of the spacing"
+    "first and last units of neighbours. The reference runs on at its speed; only a barrier brakes, from 90 % of the clear "
+    "distance on to half of it"
 )
 
 #: Columns of a message: head and tail relative to the leader (the tail moved forward by the units ahead of it), train length.
@@ -438,3 +438,12 @@ def on_a_line(tables: stated.Tables, band: dict[str, float]) -> dict[str, Any]:
     (minimum, wanted, _), spacing = stated.clear_distances(tables), tables["topology"]["spacing_m"]
     own = {"emergency_distance_m": minimum, "emergency_zone_m": 0.4 * (wanted - minimum), "range_m": max(10_000.0, 2.0 * spacing)}
     return {"controller": {**tables["controller"], **own}, "run": {**tables["run"], "sub_step_s": 0.02}}
+
+
+def in_stops(tables: stated.Tables, band: dict[str, float], braking: tuple[float, float]) -> dict[str, Any]:
+    """Tables of its rows in `trainctl compare spacing`: the emergency distance is half of the clear one, as in the paper's example.
+
+    The zone before it begins as soon as the train ahead slows down: with the zones of other rows trains touch at any spacing.
+    """
+    made, wanted = on_a_line(tables, band), tables["topology"]["spacing_m"] - stated.longest(tables)
+    return {**made, "controller": {**made["controller"], "emergency_distance_m": 0.5 * wanted, "emergency_zone_m": 0.4 * wanted}}

@@ -456,17 +456,23 @@ def alternative(tables: stated.Tables) -> dict[str, Any]:
     error = max((abs(value) for value in stated.errors_allowed(tables)), default=2351.0)
     types = {key: {"actuator_rate_per_s": 50.0, **kind} for key, kind in tables.get("train_type", {}).items()}
     # A train that follows the reference from another train's slot is far off.
-    return {**_within(2.0 * error, tables), "train_type": types}
+    return {**_within(2.0 * error, 0.5, tables), "train_type": types}
 
 
 def on_a_line(tables: stated.Tables, band: dict[str, float]) -> dict[str, Any]:
     """Tables of its row in `trainctl compare capacity`."""
-    return _within(0.5 * tables["topology"]["spacing_m"], tables)
+    return _within(0.5 * tables["topology"]["spacing_m"], 0.4, tables)
 
 
-def _within(far: float, tables: stated.Tables) -> dict[str, Any]:
-    """Tables of a law that bounds the errors at ``far`` [m]."""
-    own = {"leader_error_lower_m": -far, "leader_error_upper_m": far, "head_l1_per_s": min(0.01, 0.5 * 50.0 / far)}
+def in_stops(tables: stated.Tables, band: dict[str, float], braking: tuple[float, float]) -> dict[str, Any]:
+    """Tables of its row in `trainctl compare spacing`: steps twice as long, which changes gaps by millimetres there."""
+    made = on_a_line(tables, band)
+    return {**made, "run": {**made["run"], "sub_step_s": 0.02}}
+
+
+def _within(far: float, share: float, tables: stated.Tables) -> dict[str, Any]:
+    """Tables of a law that bounds the errors at ``far`` [m], with a ``share`` of the gain that R3' allows for these, or less."""
+    own = {"leader_error_lower_m": -far, "leader_error_upper_m": far, "head_l1_per_s": min(0.01, share * 50.0 / far)}
     return {
         "controller": {**tables["controller"], **own}, "plant": {"kind": "actuated_units"}, "observer": {"kind": "asymptotic"},
         "run": {**tables["run"], "sub_step_s": 0.01},

@@ -98,6 +98,7 @@ class Constants(NamedTuple):
     brakes: Floats  # m/s2
     faster: float  # m/s
     bounds: Bounds
+    T: float  # s, control period
 
 
 def constants(params: Params, scene: Scene) -> Constants:
@@ -106,7 +107,7 @@ def constants(params: Params, scene: Scene) -> Constants:
     return Constants(
         who, b, params.reaction_s, _follow_s(params), _margins(params, scene, who, b), params.acceleration_mps2,
         np.maximum(b, params.deceleration_mps2), params.faster_mps,
-        scene.bounds,
+        scene.bounds, scene.control_period,
     )  # fmt: skip
 
 
@@ -160,7 +161,7 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
     room = np.where(other.known, other.spacing - c.M, 0.0) + stops
     w = np.sqrt(np.maximum(np.square(c.b * c.t_r) + 2.0 * c.b * room, 0.0)) - c.b * c.t_r
     asked = (np.maximum(w, 0.0) - own.speed) / c.t_f
-    cruise = ahead.cruising(own, leader, c.who.follows, c.faster, c.bounds.speed_upper)
+    cruise = ahead.cruising(own, leader, c.who.follows, c.faster, c.bounds.speed_upper, c.T)
     return Demand(*ahead.within(ahead.combined(asked, cruise, c.who.follows, other.known), c.brakes, c.pulls, c.bounds, own))
 
 

@@ -11,9 +11,12 @@ k, phi   reaching rate [m/s2], and the width of the layer in which it is proport
 u        acceleration asked for [m/s2]
 z1, z2   estimates of the speed [m/s] and of all accelerations the model leaves out [m/s2]
 omega    bandwidth of the observer [1/s]
+w        bound of z2 [m/s2]
 T        control period [s]
 
-The law ------- The train obeys ``v' = u + f`` with an unknown f: errors of resistance, slope and mass, and what its actuators do
+The law
+-------
+The train obeys ``v' = u + f`` with an unknown f: errors of resistance, slope and mass, and what its actuators do
 late. On S = 0 the spacing error decays with c, and ``S' = -k sat(S / phi)`` is what
 
     u = a_l + c (v_l - v) + k sat(S / phi) - z2
@@ -25,11 +28,16 @@ observer is the linear one of [2]_ with both poles at -omega, over one period:
 
 whose poles in discrete time are both ``1 - omega T``. Its u is what was asked for after all limits.
 
+The speed has a ceiling, a part of the room between the reference and the maximum speed, and z2 may lower what leads there, but not
+raise it: what the observer holds against the train does not take it past its maximum speed.
+
 Departures
 ----------
 * [1]_ has a sign function in a boundary layer as well, but no observer; the constant spacing it keeps with the first train's
   speed is string stable, and without that it is only as far as a_l comes in time: with a control period of T errors may grow by
   about a_l's delay. ``trainctl compare spacing`` shows by how much.
+* z2 stays within -w .. w. An actuator at a limit the law does not know of, such as the power at high speed, is to the observer a
+  force that brakes: without a bound it takes up whatever was asked for in vain, and pushes on for some 1 / omega after the end.
 * a_l is the mean acceleration of the control period before, as the train ahead measures it.
 * Old messages are carried forward, see ``ahead``. A train that follows none takes the speed of the reference.
 
@@ -77,6 +85,7 @@ class Params(Table):
     reach_mps2: float = Field(0.3, gt=0.0, description="Reaching rate k [m/s2].")
     layer_mps: float = Field(1.0, gt=0.0, description="Width of the layer in which the reaching rate is proportional, phi [m/s].")
     observer_per_s: float = Field(0.2, gt=0.0, description="Bandwidth of the extended state observer, omega [1/s].")
+    unknown_mps2: float = Field(0.15, ge=0.0, description="Most that the observer makes up for, w [m/s2].")
     acceleration_mps2: float = Field(0.5, gt=0.0, description="Maximum acceleration asked for [m/s2].")
     deceleration_mps2: float = Field(1.0, gt=0.0, description="Maximum deceleration asked for [m/s2].")
     faster_mps: float = Field(3.0, gt=0.0, description="At most so much faster than the reference, to close up [m/s].")
@@ -91,6 +100,7 @@ class Constants(NamedTuple):
     k: float  # m/s2
     phi: float  # m/s
     omega: float  # 1/s
+    unknown: float  # m/s2
     pulls: float  # m/s2
     brakes: Floats  # m/s2
     faster: float  # m/s
@@ -117,8 +127,8 @@ def constants(params: Params, scene: Scene) -> Constants:
     who = ahead.followed(scene)
     return Constants(
         who, np.where(who.follows, who.desired, 0.0), params.surface_per_s, params.reach_mps2, params.layer_mps,
-        params.observer_per_s, params.acceleration_mps2, np.full(len(who.row), params.deceleration_mps2), params.faster_mps,
-        scene.bounds, scene.control_period,
+        params.observer_per_s, params.unknown_mps2, params.acceleration_mps2, np.full(len(who.row), params.deceleration_mps2),
+        params.faster_mps, scene.bounds, scene.control_period,
     )  # fmt: skip
 
 
@@ -156,13 +166,15 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
     other = ahead.seen(c.who, own, leader, links, heard)
     e = np.where(other.known, other.spacing - c.d, 0.0)
     S = (other.speed - own.speed) + c.c * e
-    asked = other.acceleration + c.c * (other.speed - own.speed) + c.k * np.clip(S / c.phi, -1.0, 1.0)
-    cruise = ahead.cruising(own, leader, c.who.follows, c.faster, c.bounds.speed_upper)
-    wanted = ahead.combined(asked, cruise, c.who.follows, other.known) - state.z2
+    asked = other.acceleration + c.c * (other.speed - own.speed) + c.k * np.clip(S / c.phi, -1.0, 1.0) - state.z2
+    cruise = ahead.cruising(own, leader, c.who.follows, c.faster, c.bounds.speed_upper, c.T)
+    cruise -= np.where(c.who.follows, np.maximum(state.z2, 0.0), state.z2)
+    wanted = ahead.combined(asked, cruise, c.who.follows, other.known)
     u, limited = ahead.within(wanted, c.brakes, c.pulls, c.bounds, own)
     wrong = own.speed - state.z1
     z1 = state.z1 + c.T * (state.z2 + u + 2.0 * c.omega * wrong)
-    return Demand(u, limited), State(own.speed.copy(), z1, state.z2 + c.T * c.omega**2 * wrong)
+    z2 = np.clip(state.z2 + c.T * c.omega**2 * wrong, -c.unknown, c.unknown)
+    return Demand(u, limited), State(own.speed.copy(), z1, z2)
 
 
 # What must hold before the law may be used

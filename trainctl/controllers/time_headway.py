@@ -124,7 +124,7 @@ def constants(params: Params, scene: Scene) -> Constants:
 
 
 def _gaps(params: Params, scene: Scene, who: ahead.Followed) -> tuple[Floats, Floats]:
-    """Time gap [s] and spacing at standstill [m] of every train, (n,); 1 s and 0 m of those that follow nobody."""
+    """Time gap [s] and spacing at standstill [m] of every train, (n,); 1 s and 0 m of those that follow none."""
     top = ahead.fastest(scene.reference)
     d = np.where(who.follows, who.desired, top)
     if params.time_gap_s is not None:
@@ -170,7 +170,7 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
     spacing = np.where(other.known, other.spacing, 0.0)
     e = spacing - (c.r + c.h * own.speed)
     asked = c.k_a * other.acceleration + ((1.0 - c.k_a) * (other.speed - own.speed) + c.gain * e) / c.h
-    cruise = ahead.cruising(own, leader, c.who.follows, c.faster, c.bounds.speed_upper)
+    cruise = ahead.cruising(own, leader, c.who.follows, c.faster, c.bounds.speed_upper, c.period)
     given, limited = ahead.within(ahead.combined(asked, cruise, c.who.follows, other.known), c.brakes, c.pulls, c.bounds, own)
     return Demand(given, limited), State(own.speed.copy())
 

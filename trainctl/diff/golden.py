@@ -37,7 +37,7 @@ GOLDEN, FORMAT = "golden.json", "trainctl golden"
 
 #: Logs of SUMO's that the golden of a run keeps whole; its fcd is thinned, its summary says nothing more than these.
 WHOLE = ("tripinfo", "statistics", "collisions", "vehroute")
-#: Time between kept instants if nobody says otherwise [s].
+#: Time between kept instants unless stated [s].
 EVERY_S = 60.0
 
 

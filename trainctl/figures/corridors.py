@@ -202,7 +202,7 @@ def _stops(run: Run, trains: Series, distance: dict[str, Floats]) -> list[Place]
 
 
 def _unreached(run: Run, rails: Rails, start: Floats, per: Floats) -> list[Place]:
-    """Stops on a corridor to which no train came, in the middle of their edge: nobody stood there to say where."""
+    """Stops on a corridor to which no train came, in the middle of their edge: no train stood there to say where."""
     if not len(run.stops):
         return []
     calls = run.stops.astype({"stop": str, "platform": str})

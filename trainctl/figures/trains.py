@@ -316,7 +316,7 @@ def _distinct(ranges: Any) -> list[float]:
 
 
 def in_formation(drawn: Drawn) -> Bools:
-    """True for rows of trains in a formation: as logged, else where they have a link; for all rows if nobody ever has one."""
+    """True for rows of trains in a formation: as logged, else where they have a link; for all rows if no train ever has one."""
     rows = drawn.trains.frame
     if "in_formation" in rows:
         member: Bools = drawn.trains.column("in_formation") > 0.5

@@ -67,7 +67,7 @@ def speeds(drawn: Drawn) -> Figure:
 
 
 def position_differences(drawn: Drawn) -> Figure:
-    """Above: distance of adjacent trains, tail unit to head unit, with bounds; below: distance of adjacent units."""
+    """Above: distance of adjacent trains, rear unit to leading unit, with bounds; below: distance of adjacent units."""
     figure, axes = style.panels(2, drawn.width)
     _between_trains(axes[0], drawn, "position_m", 1000.0)
     shift = {name: sum(length[:-1]) for name, length in drawn.known.length_m.items()}
@@ -87,7 +87,7 @@ def position_differences(drawn: Drawn) -> Figure:
 
 
 def speed_differences(drawn: Drawn) -> Figure:
-    """Above: speed of the tail unit of the train ahead minus own head's, with bounds; below: between adjacent units."""
+    """Above: speed of the rear unit of the train ahead minus that of the own first, with bounds; below: between adjacent units."""
     figure, axes = style.panels(2, drawn.width)
     _between_trains(axes[0], drawn, "speed_mps", 1.0)
     stated = [drawn.known.controller.get(f"speed_error_{side}_mps") for side in ("lower", "upper")]

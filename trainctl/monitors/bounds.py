@@ -98,7 +98,7 @@ class Alarms:
         """
         if self.watched:
             s.now[:] = np.stack(self.p.law.watched_bounds(self.p.params, scene))
-            if self.p.driven:  # a train in no formation is watched by nobody
+            if self.p.driven:  # a train in no formation is not watched
                 alone = np.bincount(scene.links.receiver, minlength=len(formation)) == 0
                 s.now[0, alone], s.now[1, alone] = -np.inf, np.inf
         piece = np.empty(len(formation), np.int64)
@@ -186,6 +186,8 @@ class Alarms:
             )
         back = np.flatnonzero(traffic.kept_back >= 0).tolist()
         found += [Wait(i, int(traffic.kept_back[i]), int(here.edge[i]), waiting.TURN) for i in back]
+        over = np.flatnonzero((traffic.stands_until < t - 1e-9) & ~p.roster.driven).tolist()
+        found += [Wait(i, -1, int(here.edge[i]), waiting.PARKED) for i in over]
         if p.driven:  # those whom nothing keeps that is known: their driver would start them
             known = {w.train for w in found}
             stand = np.flatnonzero(waiting.standing(here, speed, traffic.standing)).tolist()

@@ -34,7 +34,7 @@ class Track(NamedTuple):
 
     length: Floats  # (E,) m
     twin: Ints  # (E,) the same track in the other direction, -1: none
-    before: Ints  # (E,) where a train stands that hangs out behind the beginning of the edge, -1: nowhere, or nobody knows
+    before: Ints  # (E,) where a train stands that hangs out behind the beginning of the edge, -1: nowhere, or not known
     limit: Floats  # (E,) m/s
 
 
@@ -168,7 +168,7 @@ def _pieces(
                     k -= 1
                     e, begin = ways.edge[k], ways.begin[k]
                 else:
-                    bottom = max(bottom, s[i] - length[i])  # nobody has moved there
+                    bottom = max(bottom, s[i] - length[i])  # no train has moved there
                     e = track.before[e]
                     if e < 0 or begin <= bottom:
                         break

@@ -1,8 +1,8 @@
 """Who waits for whom: told when a wait grows long, and when trains wait for each other in a circle.
 
-A train waits if it stands, not at its own stop, or is due to enter and cannot. What it waits for is what forbids it to start: the
-train ahead, or whoever has the switch, or the block behind the signal, that it stands at. It needs all of these to go first; so
-trains of which each waits for another one of them never go again by themselves.
+A train waits if it stands, not at its own stop, or is due to enter, or to come back from where it is parked, and cannot. What it
+waits for is what forbids it to start: the train ahead, or whoever has the switch, or the block behind the signal it stands at. It
+needs all of these to go first; so trains of which each waits for another one of them never go again by themselves.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 STANDS_MPS = 0.05
 
 #: What is waited at; ``Wait.place`` is one of them.
-TRAIN, SWITCH, SIGNAL, ENTRY, TURN = "train", "switch", "signal", "entry", "turn"
+TRAIN, SWITCH, SIGNAL, ENTRY, TURN, PARKED = "train", "switch", "signal", "entry", "turn", "parked"
 
 
 class Wait(NamedTuple):
     """A train and one thing it waits for."""
 
     train: int
-    other: int  # whose it is, -1: nobody's that is known
+    other: int  # whose it is, -1: not known
     edge: int  # where the other one stands, or the edge that must not be entered; -1: not known
     place: str | None  # None: it stands, and nothing that is known keeps it
 
@@ -64,7 +64,7 @@ def waits(
     step, theta : float
         Step [s] and lead of the plant, as ``authority.judge`` takes them.
     own_stop : ndarray, shape (n,)
-        Trains that stand at their own stops: they wait for nobody.
+        Trains that stand at their own stops: they wait for none.
     """
     stand = standing(here, speed, own_stop)
     if not stand.any():
@@ -120,7 +120,7 @@ def entries(roster: Roster, came: Bools, due: Sequence[int], t: float, held: Hel
 def circles(found: Sequence[Wait]) -> list[list[int]]:
     """Trains that wait for each other: of each circle, or circles that hang together, the trains in ascending order."""
     edges = {(w.train, w.other) for w in found if w.other >= 0}
-    while True:  # whoever waits for one that does not wait, or is waited for by nobody, is in no circle
+    while True:  # whoever waits for one that does not wait, or that no train waits for, is in no circle
         waiting, wanted = {i for i, _ in edges}, {j for _, j in edges}
         left = {(i, j) for i, j in edges if j in waiting and i in wanted}
         if left == edges:
@@ -155,7 +155,7 @@ class Waiting:
         self.ids, self.edges, self.limit_s = ids, edges, limit_s
 
     def initial(self) -> State:
-        """Nobody waits yet."""
+        """No train waits yet."""
         return State(np.full(len(self.ids), np.nan), np.zeros(len(self.ids), bool), {"circles": [], "long": 0})
 
     def new(self, t: float, found: Sequence[Wait], due: Mapping[int, float], s: State) -> Iterator[tuple[str, dict[str, Any]]]:

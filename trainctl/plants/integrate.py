@@ -343,7 +343,7 @@ def described(*modules: Any) -> str:
 def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...], exchanges: bool = True) -> Parts:
     """Make the functions of the closed loop ready for ``arguments``, those of ``advance`` after ``parts``.
 
-    Where nobody ``exchanges`` messages at instants, ``exchange`` is not made ready: that takes seconds.
+    Where no train ``exchanges`` messages at instants, ``exchange`` is not made ready: that takes seconds.
 
     They serve as long as the types of the arguments stay: new values, links and constants of the same shape of data need no
     new call. Compiled code is cached on disk between processes.

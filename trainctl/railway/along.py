@@ -1,4 +1,4 @@
-"""Neighbours along the ways trains take: where everybody is, and who is next ahead.
+"""Neighbours along the ways trains take: where every train is, and which is next ahead.
 
 A train's way is the list of edges it runs over from its departure until it leaves the net. On every edge its way is compared with
 the trains that stand there (sorted by how far their fronts are past the start of the edge), on every edge where tracks join also

@@ -2,7 +2,10 @@
 
 What a signal shows belongs to its track, not to a train: whoever follows another one sees the green of that one, and the red a step
 or two after it has passed. So green counts for the first train before a signal alone, and for that one only once it has been the
-first for ``SETTLES_S``; all others stop before the signal.
+first, and has asked, for ``SETTLES`` steps; all others stop before the signal.
+
+Who sets the signals may think better of a green, even while a train can stop no more. So a train claims every signal that it will
+not be able to stop before by the next step: until it has passed, nobody else gets what it needs.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from trainctl.signals import Bools, Floats, Ints
 
 keep_by_sources()  # before anything below is decorated
 
-#: So many steps a signal takes to show what it means to the train that has just come to be the first before it.
+#: So many steps a signal takes to show what it means to a train that has just come to be the first before it, or to ask.
 SETTLES = 3
 
 #: A train stands this far before a signal [m].
@@ -46,6 +49,7 @@ class State(NamedTuple):
     place: Floats  # (n,) m, where that is on its way
     behind: Ints  # (n,) the edge behind it, -1: none
     cleared: Floats  # (n,) m, up to where each train might go
+    claims: list[list[int]]  # [train, signal], by train: green, and the train cannot stop any more by the next step
 
 
 class Told(NamedTuple):
@@ -84,7 +88,7 @@ def none(signals: int, trains: int) -> State:
     """Nothing seen yet."""
     return State(
         first=np.full(signals, -1), steps=np.zeros(signals, np.int64), red=np.full(trains, -1), place=np.full(trains, np.nan),
-        behind=np.full(trains, -1), cleared=np.full(trains, -np.inf),
+        behind=np.full(trains, -1), cleared=np.full(trains, -np.inf), claims=[],
     )  # fmt: skip
 
 
@@ -94,7 +98,7 @@ def sighted(ways: Ways, at: Ints, row: Ints, s: Floats, present: Bools, horizon:
 
 
 def decide(
-    ways: Ways, seen: Sighted, green: Bools, s: Floats, present: Bools, braking: Floats, before: State
+    ways: Ways, seen: Sighted, green: Bools, s: Floats, present: Bools, asks: Bools, braking: Floats, binding: Floats, before: State
 ) -> tuple[State, Held, list[Told]]:
     """How far every train may go.
 
@@ -106,8 +110,10 @@ def decide(
         Signals ahead of them, and of those that are not on the net yet.
     green : ndarray of bool, shape (V,)
         What the signal of every row of ``seen`` shows.
-    s, present, braking : ndarray, shape (n,)
-        Front [m], whether it is on the net, and braking distance of every train [m].
+    s, present, asks : ndarray, shape (n,)
+        Front of every train [m], whether it is on the net, and whether it asks for signals: not while it stands at a stop.
+    braking, binding : ndarray, shape (n,)
+        Braking distance of every train [m]; how far from now it may have stopped at least if it is told of red one step later [m].
     before : State
         A step ago.
 
@@ -126,7 +132,7 @@ def decide(
     near_last = np.lexsort((-seen.train, -seen.room, seen.signal))
     near_last = near_last[there[near_last]]
     first[seen.signal[near_last]] = seen.train[near_last]  # the last one written is the nearest
-    steps = np.where((first >= 0) & (first == before.first), before.steps + 1, 0)
+    steps = np.where((first >= 0) & (first == before.first) & asks[first], before.steps + 1, 0)
     own = first[seen.signal] == seen.train
     free = green & own & (steps[seen.signal] >= SETTLES)
     room, zone, by = np.full(n, np.inf), np.full(n, -1, np.int64), np.full(n, -1, np.int64)
@@ -137,13 +143,15 @@ def decide(
     zone[train], red[train], place[train] = ways.edge[seen.row[stops]], seen.signal[stops], s[train] + seen.room[stops]
     by[train] = np.where(own[stops], -1, first[seen.signal[stops]])
     red, place = np.where(present, red, -1), np.where(present, place, np.nan)
+    bound = np.flatnonzero(free & (seen.room < np.fmin(binding, place - s)[seen.train]))
+    claims = [[i, q] for i, q in zip(seen.train[bound].tolist(), seen.signal[bound].tolist(), strict=True)]
     cleared = np.where(present, np.where(red >= 0, place, np.inf), -np.inf)
     passed, lost = (before.red >= 0) & present & (s > before.place), (cleared < before.cleared) & (place - s < braking)
     for i in np.flatnonzero(passed).tolist():  # unless it has turned, or has been led another way
         passed[i] = _leads_past(ways, i, float(before.place[i]), int(before.behind[i]))
     told = [Told(i, int(before.red[i]), True, 0.0) for i in np.flatnonzero(passed).tolist()]
     told += [Told(i, int(red[i]), False, float(place[i] - s[i])) for i in np.flatnonzero(lost & ~passed).tolist()]
-    return State(first, steps, red, place, np.where(red >= 0, zone, -1), cleared), Held(room, zone, by), told
+    return State(first, steps, red, place, np.where(red >= 0, zone, -1), cleared, claims), Held(room, zone, by), told
 
 
 def _leads_past(ways: Ways, i: int, place: float, edge: int) -> bool:
@@ -153,8 +161,13 @@ def _leads_past(ways: Ways, i: int, place: float, edge: int) -> bool:
 
 
 def order(ways: Ways, joins: Bools, row: Ints, s: Floats, present: Bools, horizon: float, room: Floats) -> Order:
-    """Turns at joins as signals give them: who has none before the join that stops it goes first, the nearest of these first."""
+    """Turns at joins as signals give them: who has none before the join that stops it goes first, the nearest of these first.
+
+    Of a train that passes a join more than once they are those of the first time.
+    """
     edge, train, away = _approaching(ways, joins, row, s, present, horizon, room)
+    first = np.unique(edge * len(row) + train, return_index=True)[1]  # each train's are there from near to far
+    edge, train, away = edge[first], train[first], away[first]
     by_edge = np.lexsort((train, away, edge))
     return Order(edge[by_edge], train[by_edge], np.arange(len(edge)))
 

@@ -63,7 +63,7 @@ def bodies(places: Places, virtual: bool = True) -> Bodies:
     That is safe, whatever becomes of j. As long as i can brake behind j, and j before k, with D the way to a stand,
     ``d_ij >= D(v_i) - D(v_j)`` and ``d_jk >= D(v_j) - D(v_k)``; so, in the sum, i before k: ``d_ik >= D(v_i) - D(v_k)``, and
     a length more. The same holds of a k that comes the other way or stands. So k is far enough away when it comes to sight,
-    because j leaves the net or takes another way. What j need not heed nobody keeps clear of for i, so that is told: who passes
+    because j leaves the net or takes another way. What j need not heed no train keeps clear of for i, so that is said: who passes
     a join after j and before i, and what lies across a track that j is over already. Of several that come the other way on one
     edge the first hides the others by the same sum: they follow it.
 
@@ -90,7 +90,7 @@ def obstacles(places: Places, virtual: bool = True) -> Obstacles:
 def fouling(places: Places) -> Bools:
     """Whether the tail of each train lies, or may lie, on another or across its track, behind the beginning of its way; (n,).
 
-    Nobody comes up to such a tail: its train was put there. So it is to be asked before a train is.
+    No train comes up to such a tail: its train was put there. So it is to be asked before a train is.
     """
     found = np.zeros(len(places.row), bool)
     for p in np.flatnonzero(places.piece_row < 0).tolist():

@@ -1,4 +1,4 @@
-"""Whether everybody can still get out if a train is let in: the rule that no trains come to wait for each other in a circle.
+"""Whether all trains can still get out if one is let in: the rule that no trains come to wait for each other in a circle.
 
 Every train runs on by itself until it *stands*: before the first stretch ahead that it has not been granted, before a join where it
 is another's turn, or behind a train that stands ahead of it; or it leaves the net. Trains that stand before one stretch stand
@@ -12,11 +12,11 @@ twin of that or across, but for those ahead of it that it turns its rear to.
 Circles of joins alone, without single track or crossings, are not looked at (a roundabout that is full): those are told, see
 ``monitors.waiting``.
 
-Progress. In a safe state some train needs nobody: a finite graph without a circle has a node without successors. When all stand,
-its whole way is free, and nobody goes before it. If it is granted what it asks for next it still needs nobody, so it is on no
-circle then, and the rule lets it go. So whenever all stand somebody is granted something, and every train has finitely many
+Progress. In a safe state some train needs no other: a finite graph without a circle has a node without successors. When all stand,
+its whole way is free, and none goes before it. If it is granted what it asks for next it still needs no other, so it is on no
+circle then, and the rule lets it go. So whenever all stand some train is granted something, and every train has finitely many
 stretches. What else could keep it: a request that waits bars later ones only while what it waits for clears by itself, that is, if
-nobody stands there; and who is to enter has nothing that others could need.
+no train stands there; and one that is to enter has nothing that others could need.
 
 The test is a search over edges of ways, and for trains behind each other over pairs of trains: polynomial in trains and edges.
 """

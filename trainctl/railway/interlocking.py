@@ -1,14 +1,14 @@
 """First come, first served where ways meet: who goes first at joins, and who may enter what only one can use.
 
-Two kinds of places. A *join* is an edge that two or more edges lead into: the trains get a turn there, nobody is held, and the
+Two kinds of places. A *join* is an edge that two or more edges lead into: the trains get a turn there, none is held, and the
 turns go to ``along.places``. A *stretch* is a longest run of edges on a train's way that others use as well, on the twin (single
 track) or across: it is exclusive against those, while trains that go the same way may follow each other. A train requests what
 lies within its reach, and keeps its request until its rear has left or its way no longer leads there. What it has passed is free
 at once.
 
 Deadlock: a train is let into a stretch only if behind it, before the next stretch, it finds room to stand with all who will stand
-there, or else together with the next one; and only if everybody can still get out then, see ``deadlock``. While it waits for that,
-later trains may overtake it; this is the only exception to first come, first served. Nobody enters the net that would overtake so.
+there, or else together with the next one; and only if all trains can still get out then, see ``deadlock``. While it waits for that,
+later trains may overtake it; this is the only exception to first come, first served. None enters the net that would overtake so.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Decision(NamedTuple):
     train: int
     zone: int
     granted: bool
-    by: int  # -1: nobody
+    by: int  # -1: none
     join: bool  # whether ``zone``, an edge, is a join or the beginning of a stretch
 
 
@@ -200,7 +200,7 @@ def request(
                 stuck_itself = any(True for _ in deadlock.needs(here, blocker, trains.before(queues)))
                 if not (stuck_itself or _stood_on(here, zones.ends, i, [k, *rest])):
                     waiting.add(i, [k, *rest])
-            if blocker < 0 and outside[i]:  # nobody comes in before one who waits for the same, whatever for
+            if blocker < 0 and outside[i]:  # no train comes in before one that waits for the same, whatever for
                 blocker = stuck.blocker(i, [k, *rest])
             if blocker < 0 and i in shut and rest and shut[i][0] <= zones.ends[rest[-1]]:
                 blocker = shut[i][1]

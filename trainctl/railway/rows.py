@@ -50,8 +50,8 @@ def tails(
 ) -> tuple[Ints, Ints, Ints, Floats]:  # fmt: skip
     """Find every edge a train's tail may be on behind the beginning of its way.
 
-    Where one edge leads into the first the tail lies on that one, and so on back. Where several do nobody knows on which it
-    lies, and it counts on all of them: two tails more than there are cost a little time, one less a collision.
+    Where one edge leads into the first the tail lies on that one, and so on back. Where several do it is not known on
+    which it lies, and it counts on all of them: two tails more than there are cost a little time, one less a collision.
 
     Parameters
     ----------

@@ -167,7 +167,7 @@ def as_ordered(rate: float, trains: int) -> Assumed:
 
 
 def no_targets() -> Targets:
-    """Nothing in the way of anybody."""
+    """No train has anything in its way."""
     none = np.zeros(0, np.int64)
     return Targets(none, np.zeros(0), np.zeros(0), np.zeros(0, bool), none, none)
 
@@ -319,7 +319,7 @@ def too_late(
 def way_to_stop(params: Params, assumed: Assumed, speed: Floats, acceleration: Floats, step_s: float, theta: float) -> Floats:
     """Way [m] in which every train surely stops by braking as planned, or as hard as it surely can if that is less, shape (n,).
 
-    A switch that is nearer must not be turned any more. Where nobody is protected braking counts as planned: nothing is relied on.
+    A switch that is nearer must not be turned any more. Where none is protected braking counts as planned: nothing is relied on.
     Arguments are those of ``verdict``.
     """
     if params.mode != "on":

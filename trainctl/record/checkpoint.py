@@ -88,12 +88,13 @@ class Tape:
     def __init__(self, world: World, folder: Path, saved: Saved | None = None) -> None:
         self.world, self.path = world, folder / MOVES
         none: dict[str, Any] = {
-            "steps": 0, "trains": 0, "crc": 0, "routes": [], "entries": [], "parked": [], "halted": [], "turns": [],
+            "steps": 0, "trains": 0, "crc": 0, "routes": [], "entries": [], "parked": [], "halted": [], "claims": [],
+            "turns": [],
         }  # fmt: skip
         told = saved.values["tape"] if saved else none
         self.steps, self.trains, self.crc = told["steps"], told["trains"], told["crc"]
         self.routes, self.entries, self.parked = list(told["routes"]), list(told["entries"]), list(told["parked"])
-        self.halted, self.turns = list(told["halted"]), list(told["turns"])
+        self.halted, self.turns, self.claims = list(told["halted"]), list(told["turns"]), list(told["claims"])
         self.buffer = bytearray()
         size = 8 * self.steps * self.trains
         if saved:
@@ -108,6 +109,7 @@ class Tape:
         """Tell the world, which has just started, everything once more."""
         told = (self.routes, self.entries, self.parked, self.halted, self.turns)
         routes, entries, parked, halted, turns = (_by_step(one) for one in told)
+        claims = dict(self.claims)
         rows = max(1, PIECE // (8 * max(self.trains, 1)))
         with self.path.open("rb") as file:
             for k in range(self.steps):
@@ -121,6 +123,8 @@ class Tape:
                     self.world.park(train, off)
                 for train, stands in halted.get(k, ()):
                     self.world.halt(train, stands)
+                if k in claims:
+                    self.world.claim(claims[k])
                 for train, (edges, arrival) in turns.get(k, ()):
                     self.world.turn(train, tuple(edges), np.inf if arrival is None else arrival)
                 self.world.move(piece[k % rows].copy(), step)
@@ -159,6 +163,11 @@ class Tape:
         self.halted.append((self.steps, train, stands))
         self.world.halt(train, stands)
 
+    def claim(self, claims: list[list[int]]) -> None:
+        """Say which trains hold which signals."""
+        self.claims.append((self.steps, claims))
+        self.world.claim(claims)
+
     @property
     def box(self) -> SignalBox | None:
         """Who sets the signals."""
@@ -192,7 +201,8 @@ class Tape:
         """Everything told until now, safe on the disk, as a checkpoint names it."""
         self._flush()
         os.fsync(self.file.fileno())
-        told = {"routes": self.routes, "entries": self.entries, "parked": self.parked, "halted": self.halted, "turns": self.turns}
+        told = {"routes": self.routes, "entries": self.entries, "parked": self.parked, "halted": self.halted}
+        told |= {"claims": self.claims, "turns": self.turns}
         return {"steps": self.steps, "trains": self.trains, "crc": self.crc, **told}
 
     def close(self) -> None:

@@ -79,7 +79,7 @@ def run_name(scenario: str | Path, settings: Sequence[str] = ()) -> str:
 
 
 def place_for(folder: Path) -> tuple[Path, str]:
-    """Where a run goes that is to lie at ``folder`` if nothing of somebody else's is lost by it, and why elsewhere, in words.
+    """Where a run for ``folder`` goes so that nothing else is lost by it, and why elsewhere, in words.
 
     The folder itself, else the first free one of ``DIR-2``, ``DIR-3``, ...
     """

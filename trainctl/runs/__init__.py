@@ -19,7 +19,7 @@ columns
     a column of it: ``time``, or ``begin, end, interval_id`` and, around lanes, ``edge_id``. A column may be missing from a batch
     where it holds nothing.
 types
-    XML and CSV: texts, as they are written, so that nobody has to guess decimals; ``numbers`` makes them float64. Parquet: float32
+    XML and CSV: texts, as they are written, so that decimals need not be guessed; ``numbers`` makes them float64. Parquet: float32
     and float64, integers, texts, as stored (truth values as texts, dictionaries unpacked). Null where nothing stands, and nothing
     but an empty text. A human-readable time (``1:00:00:02.50``) is a text in seconds (``86402.50``).
 batches

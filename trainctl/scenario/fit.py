@@ -14,6 +14,8 @@ from trainctl.topology import graph
 def can_brake(p: Model) -> list[str]:
     """Whether every train can do what the supervisor relies on."""
     rules = p.supervision
+    if rules.mode != "off" and (off := _masses_off(p)):
+        return [f"{said}: supervisor.mode must be off, since it relies on the stated masses" for said in off]
     short = np.flatnonzero(p.sure_braking < rules.emergency_mps2 - 1e-9) if rules.mode != "off" else np.zeros(0, np.int64)
     if not len(short):
         return []
@@ -22,6 +24,14 @@ def can_brake(p: Model) -> list[str]:
     return [
         f"supervisor.emergency_mps2 = {rules.emergency_mps2:g}: train {p.scenario.ids[i]} can brake with {minimum:.6g} m/s2 at"
         f" most{among}"
+    ]
+
+
+def _masses_off(p: Model) -> list[str]:
+    """Masses that are not as stated, as keys and values."""
+    kinds = p.scenario.train_type.items()
+    return [
+        f"train_type.{name}.mass_error_percent = {kind.mass_error_percent:g}" for name, kind in kinds if kind.mass_error_percent
     ]
 
 
@@ -40,6 +50,8 @@ def fits(p: Model) -> list[str]:
     if p.self_driven:
         return found + list(p.law.unfit(p.scenario))
     found += [*_messages_fit(p), *_disturbances_fit(p)]
+    if not p.has_units:
+        found += [f"{said}: needs a plant with units" for said in _masses_off(p)]
     if not p.sampled:
         found += [
             f"train_type.{name}.force_share = installed: law {p.scenario.controller.law} gives every unit its own force"

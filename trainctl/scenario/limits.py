@@ -20,7 +20,7 @@ def _tighter(key: str) -> Any:
 
 
 def stated(scenario: Scenario, plant: Plant, params: Any) -> Bounds:
-    """What [bounds], [plant] where it clamps, and [[train]] say of every train; infinite where nobody does."""
+    """What [bounds], [plant] where it clamps, and [[train]] say of every train; infinite where nothing is stated."""
     rows = list(scenario.bounds_of_trains())
     for k, key in enumerate(KEYS):
         clamp = getattr(params, key) if key in plant.CLAMPS else None
@@ -89,7 +89,7 @@ def differing(scenario: Scenario, plant: Plant, params: Any) -> list[str]:
 
 
 def resolved(scenario: Scenario, said: Bounds, bounds: Bounds) -> Scenario:
-    """The scenario as it is logged: input bounds that nobody stated follow from the units, a law's file has its name alone.
+    """The scenario as it is logged: input bounds that are not stated follow from the units, a law's file has its name alone.
 
     Parameters
     ----------

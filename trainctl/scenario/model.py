@@ -207,7 +207,7 @@ class Model:
 
     @property
     def looks_ahead(self) -> bool:
-        """Whether anybody asks what is ahead of a train: its driver, or the supervisor."""
+        """Whether anything asks what is ahead of a train: its driver, or the supervisor."""
         return self.driven or self.supervision.mode != "off"
 
     @cached_property

@@ -141,7 +141,7 @@ def obeying(
     below : float
         How far to stay below the limits (not the cap) [m/s].
     stop : float, optional
-        Where the reference comes to a stand [m]; it never does if left out.
+        Where the reference comes to a standstill [m]; it never does if left out.
 
     Returns
     -------
@@ -193,7 +193,7 @@ def _allowed(
         limit, at = min(force)
         v = min(limit - below, cap)
         if v <= 0.0:
-            raise ValueError(f"the limit of {limit:.10g} m/s at {at:.10g} m leaves nothing {below:g} m/s below it")
+            raise ValueError(f"the limit of {limit:.10g} m/s at {at:.10g} m is not above below_limit_mps = {below:g}")
         if found and found[-1][2] == v:
             a = found.pop()[0]
         found.append((a, b, v))

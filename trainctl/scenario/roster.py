@@ -64,7 +64,7 @@ class Roster(NamedTuple):
     speed: Floats  # (n,) m/s at departure, NaN: as fast as is safe
     like: tuple[str, ...]  # who enters as fast as is safe, but no faster than those on its edge: their "avg", the "last"; else ""
     top_speed: Floats  # (n,) m/s
-    speed_factor: Floats  # (n,) share of a speed limit that a train keeps to, at most 1: nobody is driven above a limit
+    speed_factor: Floats  # (n,) share of a speed limit that a train keeps to, at most 1: no train is driven above a limit
     legs: tuple[tuple[tuple[str, ...], ...], ...]  # its route in parts, up to its turns and its end: edge ids, with internal ones
     stops: tuple[tuple[Stop, ...], ...]
     cooperates: Bools  # (n,)
@@ -322,7 +322,7 @@ def _events(scenario: Scenario, ids: list[str], rails: Rails) -> list[str]:
 def _types(scenario: Scenario, traffic: Configuration, ours: Collection[str]) -> tuple[dict[str, TrainType], list[str]]:
     """Data of every vType that runs: the scenario's own, else what the vType says of itself.
 
-    A type that is none of ``ours`` moves nobody here: where it lacks data those of another one stand for it.
+    A type that is none of ``ours`` moves no train here: where it lacks data those of another one stand for it.
     """
     types, found = {name: kind for name, kind in scenario.train_type.items() if name != REST}, []
     for name in sorted(dict.fromkeys(d.kind for d in traffic.departures), key=lambda name: name not in ours):

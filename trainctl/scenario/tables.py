@@ -102,7 +102,7 @@ class TrafficTable(Table):
         return below
 
     cooperate: tuple[str, ...] = Field(
-        ("*",), description="Trains that join formations, by id; * stands for anything. The others are driven by themselves."
+        ("*",), description="Trains that join formations, by id; * stands for anything. The others drive alone."
     )
     others: Literal["driven", "sumo"] = Field(
         "driven",
@@ -214,6 +214,9 @@ class TrainType(Table):
         " carries its own mass, couplers stay at rest; installed: each gives the same part of its traction_n or braking_n (0: a"
         " trailer), and couplers carry the difference.",
     )
+    mass_error_percent: float | None = Field(
+        None, gt=-50.0, lt=100.0, description="True mass less the stated one [%], which law, observer and train go by; default 0."
+    )
 
     #: Keys whose list may be one shorter than the units: couplers.
     _couplers = ("coupler_stiffness_n_per_m", "coupler_damping_ns_per_m")
@@ -225,7 +228,7 @@ class TrainType(Table):
         wrong = []
         for key in type(self).model_fields:
             value = getattr(self, key)
-            if key in ("units", "force_share") or value is None:
+            if key in ("units", "force_share", "mass_error_percent") or value is None:
                 continue
             if isinstance(value, tuple):
                 lengths = (self.units, self.units - 1) if key in self._couplers else (self.units,)
@@ -448,6 +451,11 @@ class Scenario(Table):
             actuator_rate=rows("actuator_rate_per_s"),
             installed=rows("force_share"),
         )
+
+    def mass_factor(self) -> Floats:
+        """True over stated mass of every unit, shape (U,)."""
+        kinds = [self.train_type[t.type] for t in self.train]
+        return np.repeat([1.0 + 0.01 * (kind.mass_error_percent or 0.0) for kind in kinds], [kind.units for kind in kinds])
 
     def bounds_of_trains(self) -> Bounds:
         """The tighter of [bounds] and what each train says, infinite where nothing is said."""

@@ -68,3 +68,10 @@ def own_stops(known: Calls, trains: Bools, next_stop: Ints, leg: Ints) -> Floats
     stands = (known.leg[at] <= leg[i]) & ~known.passes[at]
     places[i[stands]] = known.place[at[stands]]
     return places
+
+
+def merged(trains: list[int], rooms: list[float], others: Ints, further: Floats) -> tuple[list[int], list[float]]:
+    """Two lots of trains and the rooms they have [m] as one, by train."""
+    together, room = [*trains, *others.tolist()], [*rooms, *further.tolist()]
+    by_train = sorted(range(len(together)), key=together.__getitem__)
+    return [together[k] for k in by_train], [room[k] for k in by_train]

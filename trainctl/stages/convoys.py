@@ -50,7 +50,7 @@ class Convoys:
         self.minimum = p.band[0]
 
     def initial(self) -> tuple[State, Formed]:
-        """Everybody alone, at his own speed."""
+        """Every train alone, at its own speed."""
         n, own = self.n, self.p.own[self.p.leading]
         alone = convoys.references(Pace(own[:, POSITION], own[:, SPEED], np.zeros(n)), 0.0)
         formed = Formed(None, np.arange(n), np.full(n, -1), np.zeros(n, bool), np.zeros(n), alone, (), None)

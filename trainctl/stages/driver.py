@@ -15,7 +15,7 @@ from trainctl.stages.traffic import Around
 from trainctl.stages.traffic import State as Traffic
 from trainctl.topology import convoys
 
-#: Slower than this share of the cruising speed a train leads nobody: those behind draw up to it, so as not to block what is behind.
+#: Slower than this share of the cruising speed a train leads none: those behind draw up to it, so as not to block what is behind.
 CRAWLS = 0.25
 
 #: Slower than this a train that is not to accelerate is held [m/s]: its couplers must not move it.

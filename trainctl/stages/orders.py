@@ -1,7 +1,7 @@
 """Reroutes and braking: orders that wait for their time, place or condition, and the way found over the rails.
 
 A switch is locked for a train that could not stop before it any more, so an order that comes later takes the next one. What cannot
-be done is refused, with the reason, as an event; the train goes on as it was. Only where nobody supervises the trains, an order of
+be done is refused, with the reason, as an event; the train goes on as it was. Only where the trains are not supervised, an order of
 the scenario that leads nowhere (its switch lies behind the train) is a mistake of its file and ends the run.
 """
 
@@ -135,7 +135,7 @@ class Orders:
     def braking(self, speed: Floats, s: State) -> Floats:
         """Acceleration every train is ordered to brake with (n,) [m/s2], NaN where it is not; of several orders the hardest.
 
-        Within a step it comes to a stand at most: ``speed`` (n,) [m/s] is that of every train now.
+        Within a step it comes to a standstill at most: ``speed`` (n,) [m/s] is that of every train now.
         """
         found = np.full(len(speed), np.nan)
         for number in s.acting:
@@ -198,7 +198,7 @@ class Orders:
         return edges, more
 
     def _unprotected(self, i: int, over: LineCrossover, seen: Seen, speed: Floats) -> None:
-        """What nobody would save the train from while there is no supervisor."""
+        """What nothing would save the train from while there is no supervisor."""
         cure = '[supervisor] mode = "on" does'
         if over.speed_mps < speed[i]:
             raise Refused(

@@ -1,4 +1,4 @@
-"""Whether there is room at the place of a train that is to come: nobody is under it, and nobody must brake hard for it."""
+"""Whether there is room at the place of a train that is to come: no train is under it, and none must brake hard for it."""
 
 from __future__ import annotations
 

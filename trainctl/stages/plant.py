@@ -148,9 +148,8 @@ class Units:
         self.period = top.communication_period_s
         self.gradient = _slopes(p)
         self.moving = cast(UnitPlant, p.plant)
-        self.plant = self.moving.constants(
-            p.plant_params, p.consists, self.gradient, faults=p.scenario.fault, trains=p.scenario.ids
-        )
+        true = p.consists._replace(mass=p.consists.mass * p.scenario.mass_factor())  # all others go by what is stated
+        self.plant = self.moving.constants(p.plant_params, true, self.gradient, faults=p.scenario.fault, trains=p.scenario.ids)
         self.noise_hold = p.plant.noise_hold(p.plant_params)
         self.noisy = self.noise_hold is not None
         self.pool: ThreadPoolExecutor | None = None
@@ -351,7 +350,7 @@ class Units:
         return more
 
     def overrun(self, own: Floats, braking: float) -> Floats:
-        """How much farther every train comes to a stand than by ``braking`` [m/s2] from now on, as actuators act late [m], (n,).
+        """How much farther every train runs to standstill than by ``braking`` [m/s2] from now on, as actuators act late [m], (n,).
 
         Until its brakes act a train gains the speed (a + b) / r on the plan, and loses it only by braking to the end.
         """

@@ -45,7 +45,7 @@ class Protect:
         t : float
             Now [s].
         view : View or None
-            What is ahead; None: nobody looks, nobody protects.
+            What is ahead; None: no train looks ahead or is protected.
         own : ndarray, shape (U, s)
             State of all units.
         acceleration, swing : ndarray, shape (n,)

@@ -40,7 +40,7 @@ class Rerouters:
         return np.unique(np.array([index[e] for c in rerouters for e in c.at if e in index], np.int64))
 
     def initial(self) -> State:
-        """Nobody has come by."""
+        """No train has come by."""
         nowhere = np.full(len(self.p.scenario.ids), -1)
         return State(nowhere, nowhere.copy())
 

@@ -75,9 +75,10 @@ class Signals:
         """
         if box is None:
             return s, None
-        at = self._table(ways)
-        step, v = self.p.scenario.run.step_s, np.maximum(speed, 0.0)
-        braking = supervisor.stopping_distance(v, self.rate, step, self.p.step_theta)
+        at, seen = self._table(ways), traffic.on_track(seen)
+        step, theta, v = self.p.scenario.run.step_s, self.p.step_theta, np.maximum(speed, 0.0)
+        braking = supervisor.stopping_distance(v, self.rate, step, theta)
+        binding = self._binding(v)
         farthest = float(np.max(braking + 10.0 * step * v, where=seen.present, initial=0.0)) + BEYOND_M
         horizon = np.where(seen.present, farthest, self.entering)
         sighted = aspects.sighted(ways, at, seen.row, seen.position, seen.present | ~traffic.came, horizon)
@@ -85,7 +86,9 @@ class Signals:
         known = seen.present[sighted.train]
         signals, which = np.unique(sighted.signal[known], return_inverse=True)
         green[known] = box.green(signals)[which]
-        now, held, told = aspects.decide(ways, sighted, green, seen.position, seen.present, braking, s.aspects)
+        now, held, told = aspects.decide(
+            ways, sighted, green, seen.position, seen.present, ~traffic.standing, braking, binding, s.aspects
+        )  # fmt: skip
         ids, roster = self.p.scenario.ids, self.p.roster
         for one in (one for one in told if not roster.driven[one.train]):
             name = roster.signals[one.signal].name
@@ -109,7 +112,17 @@ class Signals:
         n = len(seen.row)
         sighted = aspects.sighted(ways, self._table(ways), seen.row, seen.position, np.ones(n, bool), self.entering)
         none, nobody = np.zeros(len(sighted.train), bool), np.zeros(n, bool)
-        return aspects.decide(ways, sighted, none, seen.position, nobody, np.zeros(n), self.initial().aspects)[1]
+        return aspects.decide(
+            ways, sighted, none, seen.position, nobody, nobody, np.zeros(n), np.zeros(n), self.initial().aspects
+        )[1]  # fmt: skip
+
+    def _binding(self, speed: Floats) -> Floats:
+        """How far from here every train may come to a stand that is told to stop one step later [m], shape (n,)."""
+        rules, relied, step = self.p.supervision, self.p.assumed, self.p.scenario.run.step_s
+        top = speed + (rules.greatest_mps2 + relied.scatter) * step + relied.drift + relied.surge
+        top = top + relied.lag * (rules.greatest_mps2 + rules.emergency_mps2)
+        room = top * step + supervisor.stopping_distance(top, self.rate, step, self.p.step_theta)
+        return room + relied.uncertainty + aspects.STANDS_BEFORE_M
 
     def _table(self, ways: Ways) -> Ints:
         """Signals along the ways, made anew where these have changed."""

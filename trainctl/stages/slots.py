@@ -30,7 +30,7 @@ class Slots:
         self.track_of = np.array([p.line.track_ids.index(t) for t in p.line.tracks], np.int64)
 
     def initial(self) -> tuple[State, Formed]:
-        """Everybody belongs to the formation of the track he starts on."""
+        """Every train belongs to the formation of the track it starts on."""
         n, track = len(self.p.scenario.ids), self.p.start_track.copy()
         return State(track), Formed(
             None, track.copy(), np.full(n, -1), np.ones(n, bool), np.zeros(n), References.one(self.p.reference, n), (), None

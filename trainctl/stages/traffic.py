@@ -23,6 +23,9 @@ from trainctl.stages.places import Room, meets
 from trainctl.stages.record import Journal
 from trainctl.stages.turns import Turn, Turns, stopping
 
+#: A train that passes a place just before it turns has done so this far before where it may turn last [m].
+PASSED_M = 0.5
+
 #: A train enters if it can do so with this share of its speed.
 ENTERS_WITH = 0.8
 
@@ -198,6 +201,12 @@ class Traffic:
             )  # fmt: skip
         return s._replace(came=(s.came | there) & ~(s.entering & ~there), entering=np.zeros_like(s.entering))
 
+    def kept_parked(self, trains: Sequence[int], s: State) -> State:
+        """Trains that SUMO has not let back from where they are parked: they are to ask again."""
+        s = s._replace(parked=s.parked.copy())
+        s.parked[trains] = True
+        return s
+
     def due(self, t: float, s: State) -> list[int]:
         """Trains that are to come at ``t``: of each edge the first that waits there."""
         if s.came.all():
@@ -214,8 +223,7 @@ class Traffic:
 
     def missing(self, t: float, s: State) -> list[str]:
         """Trains that were due and never came."""
-        late = np.flatnonzero(~s.came & (self.roster.depart <= t + 1e-9)).tolist()
-        return [self.p.scenario.ids[i] for i in late]
+        return [self.p.scenario.ids[i] for i in np.flatnonzero(~s.came & (self.roster.depart <= t + 1e-9)).tolist()]
 
     def entering(
         self, t: float, ways: Ways, here: Seen, speed: Floats, s: State, due: Sequence[int], reach: Floats | None = None,
@@ -235,7 +243,7 @@ class Traffic:
             before, reach = s.waits_for, self._reach(speed) if reach is None else reach
             s, held = self._request(t, ways, here, reach, asking, asking & ~stands, s)
             self._let_in(t, ways, here, speed, due, np.where(np.isin(before, due), 0.0, reach), held, s)
-        s = s._replace(parked=s.parked.copy(), stands_until=s.stands_until.copy())
+        s = s._replace(parked=s.parked.copy())
         present, came, entering, reach = here.present.copy(), s.came.copy(), s.entering.copy(), self._reach(speed)
         come: list[tuple[int, float]] = []
         kept_out: dict[int, int] = {}
@@ -252,8 +260,8 @@ class Traffic:
                 view = self._look(ways, here._replace(present=present), speed, held, s, reach)
             if s.parked[i]:
                 present[i] = self.room.returns(i, speed, view)
-                if present[i]:  # and stands for one more step, the one in which it comes back
-                    s.parked[i], s.stands_until[i], together = False, t + self.step_s, None
+                s.parked[i] = not present[i]  # and stands for one more step, the one in which it comes back
+                together = None if present[i] else together
                 continue
             v = self._entering_speed(i, ways, here, speed, view, held, s, after)
             present[i] = v is not None
@@ -335,9 +343,12 @@ class Traffic:
         there = (self.stop_of(j, s) for j in np.flatnonzero(s.parked).tolist())
         return sum(other is not None and other.name == stop.name for other in there) >= stop.lots
 
-    def _place(self, stop: Stop, s: State) -> float:
-        """Where a train that stops has to stand now [m]."""
-        return stop.place - (stop.waits_before if self._full(stop, s) else 0.0)
+    def _place(self, stop: Stop, i: int, s: State) -> float:
+        """Where train ``i`` has to stand now for a stop, or to have passed [m]: no farther than it may to turn afterwards."""
+        last = self.turns.last_place(i)
+        if stop.passing:
+            return min(stop.place, last - PASSED_M)
+        return min(stop.place, last) - (stop.waits_before if self._full(stop, s) else 0.0)
 
     def _further(self, stop: Stop, i: int) -> float:
         """How far behind a stop a train would come to a stand that passes it as fast as it may [m]; 0 if it is to stand there."""
@@ -345,7 +356,7 @@ class Traffic:
 
     def _stops(self, t: float, seen: Seen, speed: Floats, overrun: Floats, s: State) -> tuple[State, tuple[Ints, Floats], Bools]:
         """Arrive at and leave stops; the trains that have one ahead and the room to it [m], and who stops soon."""
-        trains, rooms, n = [], [], len(speed)
+        trains, rooms, n = list[int](), list[float](), len(speed)
         if not (self.calls.number.any() or self.turns.any):
             return s, nothing(n).stops, np.zeros(n, bool)
         standing = ~np.isnan(s.stands_until)
@@ -355,6 +366,7 @@ class Traffic:
         )  # fmt: skip
         asked = np.flatnonzero(seen.present & (s.next_stop < self.calls.number))
         plain, ahead = calls.on_the_way(self.calls, asked, s.next_stop, s.leg, seen.position, speed, standing)
+        plain &= ~np.isin(asked, list(self.turns.yards))  # who is to turn may have to stand before its stop
         for i in asked[~plain].tolist():
             stop = self.stop_of(i, s)
             while stop is not None and np.isnan(stop.place):
@@ -364,7 +376,7 @@ class Traffic:
             if stop is None:
                 s.stopping[i] = False
                 continue
-            room = self._place(stop, s) - float(seen.position[i])
+            room = self._place(stop, i, s) - float(seen.position[i])
             if standing[i]:
                 stays = t < s.stands_until[i] - 1e-9 or s.parked[i]
                 if speed[i] < STANDS_MPS if self.roster.driven[i] else stays:  # SUMO ends the stops of its own trains
@@ -377,29 +389,28 @@ class Traffic:
                 if stop is None:
                     s.stopping[i] = False
                     continue
-                room = self._place(stop, s) - float(seen.position[i])
+                room = self._place(stop, i, s) - float(seen.position[i])
             while stop is not None and stop.passing and room <= 0.0:
                 late = self._called(i, stop, t, t, int(seen.edge[i]), s)
                 self.journal.event(
                     t, "waypoint", train=self.p.scenario.ids[i], stop=stop.name, speed_mps=float(speed[i]), **_late(late)
                 )  # fmt: skip
                 stop = self.stop_of(i, s)
-                room = stop.place - float(seen.position[i]) if stop is not None else np.inf
+                room = self._place(stop, i, s) - float(seen.position[i]) if stop is not None else np.inf
             if stop is None:
                 s.stopping[i] = False
                 continue
             if not stop.passing and speed[i] < STANDS_MPS and room < STOP_BAND_M and not self._full(stop, s):
                 s.stands_since[i], s.stands_until[i] = t, max(t + stop.duration, stop.until)
                 more = _late(t - stop.planned) | ({"parked": True} if stop.parks else {})
-                self.journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=room, **more)
+                short = stop.place - float(seen.position[i])
+                self.journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=short, **more)
                 s.parked[i] = stop.parks
                 continue
+            beyond = self.turns.last_place(i) - float(seen.position[i]) - float(overrun[i])
             trains.append(i)
-            rooms.append(max(room - float(overrun[i]), 0.0) + self._further(stop, i))
-        trains += asked[plain].tolist()
-        rooms += np.maximum(ahead[plain] - overrun[asked[plain]], 0.0).tolist()
-        by_train = sorted(range(len(trains)), key=trains.__getitem__)
-        trains, rooms = [trains[k] for k in by_train], [rooms[k] for k in by_train]
+            rooms.append(min(max(room - float(overrun[i]), 0.0) + self._further(stop, i), max(beyond, 0.0)))
+        trains, rooms = calls.merged(trains, rooms, asked[plain], np.maximum(ahead[plain] - overrun[asked[plain]], 0.0))
         if self.turns.yards:
             free = np.array([self.stop_of(i, s) is None for i in range(n)])
             stand, further = self.turns.wanted(seen, speed, free, ~np.isnan(s.turns_since), self.stopping, STANDS_MPS)
@@ -449,17 +460,8 @@ class Traffic:
 
     def _ordered(self, t: float, ways: Ways, seen: Seen, s: State) -> list[tuple[int, int, int]]:
         """Trains that must let another one pass an edge first: train, row of the edge in its way, the other one."""
-        found = []
-        for edge, first, then in self.pairs:
-            here = [edge] if self.net.twin[edge] < 0 else [edge, self.net.twin[edge]]
-            rows = [
-                ways.first[i] + np.flatnonzero(np.isin(ways.edge[ways.first[i] : ways.first[i + 1]], here)) for i in (first, then)
-            ]
-            if not all(map(len, rows)) or s.left[first] or (not s.came[first] and self._given_up(t)[first]):
-                continue
-            if not (s.came[first] and seen.row[first] >= rows[0][0]) and not (s.came[then] and seen.row[then] >= rows[1][0]):
-                found.append((then, int(rows[1][0]), first))
-        return found
+        never = s.left | ~s.came & self._given_up(t) if self.pairs else s.left
+        return zones.passes_first(self.pairs, self.net, ways, seen.row, s.came, never)
 
     def _request(
         self, t: float, ways: Ways, seen: Seen, reach: Floats, entering: Bools, keeps: Bools, s: State

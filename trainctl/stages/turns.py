@@ -28,7 +28,7 @@ INTO_M = 2.0
 Ordered = Callable[[Ways, Ints], list[tuple[int, int, int]]]
 
 
-#: How often every train has turned, since when it stands to turn [s] (NaN: it does not), and who keeps it from that (-1: nobody).
+#: How often every train has turned, since when it stands to turn [s] (NaN: it does not), which train prevents it (-1: none).
 Known = tuple[Ints, Floats, Ints]
 
 
@@ -113,7 +113,7 @@ class Turns:
         return stand, rooms
 
     def ends(self, view: View, seen: Seen, overrun: Floats) -> View:
-        """``view`` with the end of its leg before every train that is to turn: nobody, whoever drives, runs on over it."""
+        """``view`` with the end of its leg before every train that is to turn: none runs on over it, whatever drives it."""
         trains = [i for i in self.yards if seen.present[i]]
         if not trains:
             return view

@@ -410,7 +410,7 @@ PANELS = {
 def figure(table: Sequence[dict[str, Any]], plan: CapacityPlan, path: Path, formats: Sequence[str] = ("png",)) -> list[Path]:
     """Draw the table as bars, with what each row could reach at best dashed.
 
-    Dashed is steady running that nobody hinders: in SUMO's rows at the speed of the line and the minimum headway without braking;
+    Dashed is steady running that nothing hinders: in SUMO's rows at the speed of the line and the minimum headway without braking;
     in the laws' rows at cruising speed and the desired spacing.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -166,7 +166,7 @@ def others(
 
 
 def strange(data: Mapping[str, Any], rows: Sequence[str]) -> list[str]:
-    """Rows that ``[alternative]`` names and nobody runs."""
+    """Rows that ``[alternative]`` names and no run has."""
     known = ", ".join(rows)
     return [f"alternative.{row}: no such row; there are: {known}" for row in data.get("alternative", {}) if row not in rows]
 

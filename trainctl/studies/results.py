@@ -45,7 +45,7 @@ class Part(NamedTuple):
     failure: Sequence[str | None]
     counts: Mapping[str, Floats]  # by ``COUNTS``, NaN of runs that are not complete
     metrics: Mapping[str, Floats]  # NaN: the run has none
-    alone: Sequence[str | None]  # why a run was not stacked with others; None: it was, or nobody asked
+    alone: Sequence[str | None]  # why a run was not stacked with others; None: it was, or that was not asked for
 
     def kept(self, which: Sequence[int]) -> Part:
         """These of its runs."""

@@ -19,10 +19,23 @@ from trainctl.errors import InputError, TrainctlError
 from trainctl.record.folder import write_json
 from trainctl.signals import POSITION, SPEED, Trains
 from trainctl.studies.capacity import LAW_ROWS
-from trainctl.studies.stops import REFUSED, ROWS, SAFE, Outcome, StopsPlan, in_sumo, line, reference_lines, scenario, stopped, wrong
+from trainctl.studies.stops import (
+    REFUSED,
+    ROWS,
+    SAFE,
+    Outcome,
+    StopsPlan,
+    line,
+    prepared,
+    reference_lines,
+    scenario,
+    stopped,
+    unwatched,
+    wrong,
+)
 
 if TYPE_CHECKING:
-    pass
+    from trainctl.runs.run import Run
 
 #: What was found for a row, in its folder.
 ROW = "row.json"
@@ -110,7 +123,7 @@ def found(plan: StopsPlan, row: str, out: Path, sumo: bool = False) -> dict[str,
         told |= measured(plan, row, spacing, out)
         told["law_ms_per_train"] = law_time(plan, row, spacing, out)
         if sumo:
-            told["in_sumo"] = [in_sumo(plan, row, share * spacing, range(plan.stops), out).plain() for share in (0.95, 1.0)]
+            told["in_sumo"] = in_sumo(plan, row, spacing, out)
     return {**told, "wall_time_s": time.perf_counter() - begun}
 
 
@@ -129,58 +142,83 @@ MEASURED = (
 )  # fmt: skip
 
 
+def in_sumo(plan: StopsPlan, row: str, spacing: float, out: Path) -> list[dict[str, Any]]:
+    """What comes of the stops where SUMO moves the trains: all at 95 % of a spacing and at it, and as many others at it."""
+    asked = ((0.95, range(plan.stops)), (1.0, range(plan.stops)), (1.0, range(plan.stops, 2 * plan.stops)))
+    return [
+        {"share": share, "first": stops[0], **stopped(plan, row, share * spacing, stops, out, True)[0].plain()}
+        for share, stops in asked
+    ]
+
+
 def measured(plan: StopsPlan, row: str, spacing: float, out: Path) -> dict[str, Any]:
-    """What a row costs at a spacing, from one calm run: the first train slows down by 2 m/s for a while, and goes on.
+    """What a row costs at a spacing, from two calm runs: the first train slows down by 2 m/s for a while, and goes on.
 
     Returns
     -------
     dict
         ``headway_s`` and ``trains_per_hour`` of the spacing at the speed of the reference; ``journey_time_s`` over 100 km and
-        ``energy_kwh_per_train_km``, means of all trains; ``jerk_rms_mps3``; ``string_gain``, the largest L2 gain from link to link;
-        ``messages_per_train_s``, sent.
+        ``energy_kwh_per_train_km``, means of all trains; ``jerk_rms_mps3``; ``messages_per_train_s``, sent; ``string_gain``, the
+        largest L2 gain from link to link in a run where nothing else disturbs: what is random makes errors on every link, so
+        their ratio would say nothing of how they pass on.
     """
+    headway = spacing / plan.speed_mps
+    numbers: dict[str, Any] = {**dict.fromkeys(MEASURED), "headway_s": headway, "trains_per_hour": 3600.0 / headway}
+    if (run := _calm(plan, row, spacing, out)) is not None:
+        values, trains = run.metrics, run.trains
+        speed = float(trains.groupby("train", observed=True)["speed_mps"].mean().mean())
+        numbers |= {
+            "journey_time_s": 100_000.0 / speed, "energy_kwh_per_train_km": values.get("energy.traction_kwh_per_train_km"),
+            "jerk_rms_mps3": values.get("comfort.jerk_rms_mps3"),
+            "messages_per_train_s": run.info["messages_sent"] / plan.trains / run.scenario["run"]["duration_s"],
+        }  # fmt: skip
+    if (run := _calm(plan.undisturbed, row, spacing, out)) is not None:
+        numbers["string_gain"] = run.metrics.get("string.l2_gain")
+    return numbers
+
+
+def _calm(plan: StopsPlan, row: str, spacing: float, out: Path) -> Run | None:
+    """The calm run of a row; None if it does not start, or failed."""
     from trainctl import runner
     from trainctl.scenario.build import open_scenario
 
     duration = 400.0
     tables = scenario(plan, row, spacing, [0])
     period = tables["run"].get("control_period_s", 1.0)
-    tables["run"] = {**tables["run"], "duration_s": math.ceil(duration / period) * period}
+    tables["run"] = {**tables["run"], "duration_s": math.ceil(duration / period) * period, "record_every_s": 1.0}
     tables["event"] = [{"kind": "brake", "train": "0.1", "time_s": 40.0, "until_s": 60.0, "deceleration_mps2": 0.1}]
     longer = {**line(plan, spacing, 1), "length_m": math.ceil(plan.trains * spacing + 2.0 * plan.line_mps * duration + 20_000.0)}
+    name = "calm" if plan.measured_m > 0.0 else "undisturbed"
     (out / "calm_line.toml").write_text(tomli_w.dumps(longer), encoding="utf-8")
-    file = out / "calm.toml"
+    file = out / f"{name}.toml"
     file.write_text(tomli_w.dumps({**tables, "network": {"line": "calm_line.toml"}}), encoding="utf-8")
-    headway = spacing / plan.speed_mps
-    numbers: dict[str, Any] = {**dict.fromkeys(MEASURED), "headway_s": headway, "trains_per_hour": 3600.0 / headway}
     try:
-        run = runner.run(open_scenario(str(file)), out / "calm", "numeric", True)
+        return runner.run(open_scenario(str(file)), out / name, "numeric", True)
     except TrainctlError:
-        return numbers
-    values, trains = run.metrics, run.trains
-    speed = float(trains.groupby("train", observed=True)["speed_mps"].mean().mean())
-    return numbers | {
-        "journey_time_s": 100_000.0 / speed, "energy_kwh_per_train_km": values.get("energy.traction_kwh_per_train_km"),
-        "jerk_rms_mps3": values.get("comfort.jerk_rms_mps3"), "string_gain": values.get("string.l2_gain"),
-        "messages_per_train_s": run.info["messages_sent"] / plan.trains / float(tables["run"]["duration_s"]),
-    }  # fmt: skip
+        return None
 
 
 def law_time(plan: StopsPlan, row: str, spacing: float, out: Path, periods: int = 60) -> float | None:
-    """Median time of a sampled law for one train and period, messages included [ms]; None: it is evaluated inside the plant."""
-    _, loop = stopped(plan, row, spacing, [0], out)
-    if loop is None or not loop.p.sampled:
+    """Median time of a sampled law for one train and period, messages included [ms], from just before the first train brakes on.
+
+    None: it is evaluated inside the plant.
+    """
+    loop = unwatched(prepared(plan, row, spacing, [0], out))
+    if not loop.p.sampled:
         return None
-    p, s, trains, took = loop.p, loop.state, len(loop.p.scenario.ids), []
-    memory = (s.memory,) if p.remembers else ()
-    own = s.own[p.leading]
-    now = Trains(own[:, POSITION].copy(), own[:, SPEED].copy(), loop.plant.believed_resistance(s.own))
-    leader = s.formed.references.leader(loop.time)
-    for _ in range(periods):
-        begun = time.perf_counter()
-        p.law.message(s.formed.constants, now, leader, *memory)
-        p.law.demand(s.formed.constants, now, leader, s.formed.links, s.messages.heard, *memory)
-        took.append((time.perf_counter() - begun) / trains)
+    p, trains, took = loop.p, len(loop.p.scenario.ids), list[float]()
+    while not loop.over and len(took) < periods:
+        s = loop.state
+        if loop.time >= plan.brakes_s - 5.0 and loop.k % p.scenario.run.held_steps == 0:
+            memory = (s.memory,) if p.remembers else ()
+            own = s.own[p.leading]
+            now = Trains(own[:, POSITION].copy(), own[:, SPEED].copy(), loop.plant.believed_resistance(s.own))
+            leader = s.formed.references.leader(loop.time)
+            begun = time.perf_counter()
+            p.law.message(s.formed.constants, now, leader, *memory)
+            p.law.demand(s.formed.constants, now, leader, s.formed.links, s.messages.heard, *memory)
+            took.append((time.perf_counter() - begun) / trains)
+        loop.step()
     return float(1000.0 * np.median(took))
 
 
@@ -229,7 +267,8 @@ def compare(
     if progress is not None:
         progress(len(rows) - len(todo), len(rows))
     with ProcessPoolExecutor(workers or os.cpu_count() or 1, multiprocessing.get_context("spawn")) as pool:
-        waiting = [pool.submit(_kept, plan, row, out / row, sumo) for row in todo]
+        longest_first = sorted(todo, key=lambda row: LAW_ROWS[row].CLOCK == "sampled")
+        waiting = [pool.submit(_kept, plan, row, out / row, sumo) for row in longest_first]
         for k, future in enumerate(as_completed(waiting), len(rows) - len(todo) + 1):
             future.result()
             if progress is not None:

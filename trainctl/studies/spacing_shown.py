@@ -51,6 +51,17 @@ def reasons(table: Sequence[Mapping[str, Any]]) -> list[str]:
     return found
 
 
+def sumo_lines(table: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A line for each row that was run in SUMO as well: how many stops failed at 95 % of its spacing, at it, and of the others."""
+    found = []
+    for row in table:
+        if row["in_sumo"]:
+            below, at, others = row["in_sumo"]
+            words = f"{_share(below)} at 95 %, {_share(at)} at it; of others {_interval(others)}"
+            found.append(f"{row['row'].replace('_', ' ')} in SUMO: failed {words}")
+    return found
+
+
 def _number(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 

@@ -1,11 +1,11 @@
 """Emergency stops side by side: the question of ``studies.spacing``, and what comes of one spacing.
 
-How close trains may follow each other under a law: the smallest desired spacing at which nobody touches in any emergency stop.
+How close trains may follow each other under a law: the smallest desired spacing at which no trains touch in any emergency stop.
 
 The question is the same for all laws. Trains on a level line run at one speed, at their desired spacing but for small errors.
 Then the first one brakes as hard as it can, by an order of its own, to a stand; the reference of the others does not change, so
 they learn of it by messages alone. Messages come a period late, and some not at all, mostly in bursts. Brakes and running
-resistance are unlike from train to train, and no law is told by how much; a force nobody knows of acts on each, and measured
+resistance are unlike from train to train, and no law is told by how much; an unknown force acts on each, and measured
 positions are off (for continuous laws they are exact: such a law has no instants to measure at). Nothing protects the trains.
 
 A stop fails if two trains touch, or one is faster than the line. The **smallest safe spacing** is found by bisection with the
@@ -19,7 +19,9 @@ is random in a stop is a function of its number and of the seed alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
     from trainctl.scenario.model import Model
     from trainctl.signals import Bools
     from trainctl.stages.record import Journal
+    from trainctl.world import World
 
 ROWS = tuple(LAW_ROWS)
 
@@ -65,7 +68,7 @@ class StopsPlan(NamedTuple):
     seed: int = 1
     brake_scatter: float = 0.05  # brakes of a train, either way
     resistance_scatter: float = 0.2
-    input_mps2: float = 0.02  # force nobody knows of, uniform, anew every second
+    input_mps2: float = 0.02  # unknown force, uniform, drawn anew every second
     measured_m: float = 2.0  # error of measured positions, uniform
     position_error_m: float = 5.0  # at the start, uniform
     speed_error_mps: float = 0.2
@@ -74,6 +77,13 @@ class StopsPlan(NamedTuple):
     loss: float = 0.02  # of messages in good times; in bad ones none arrives
     good_s: float = 60.0  # mean length of good times
     bad_s: float = 3.0
+
+    @property
+    def undisturbed(self) -> StopsPlan:
+        """The same without anything that differs from train to train or is random, but for the brakes."""
+        return self._replace(
+            resistance_scatter=0.0, input_mps2=0.0, measured_m=0.0, position_error_m=0.0, speed_error_mps=0.0, loss=0.0, bad_s=0.0
+        )
 
     @property
     def brakes_mps2(self) -> float:
@@ -133,7 +143,7 @@ def scenario(plan: StopsPlan, row: str, spacing: float, stops: Sequence[int], sl
     tables: dict[str, Any] = {
         "schema_version": 1,
         "title": f"{len(stops)} emergency stops of the first train under {row.replace('_', ' ')}, {spacing:.6g} m apart",
-        "run": {"duration_s": plan.duration_s, "step_s": 1.0, "sub_step_s": 0.1, "seed": plan.seed},
+        "run": {"duration_s": plan.duration_s, "step_s": 1.0, "sub_step_s": 0.1, "seed": plan.seed, "record_every_s": 60.0},
         "plant": {"kind": "coupled_units"},
         "reference": {"speed_mps": plan.speed_mps, "position_m": first},
         "bounds": {"speed_upper_mps": plan.line_mps},
@@ -150,14 +160,15 @@ def scenario(plan: StopsPlan, row: str, spacing: float, stops: Sequence[int], sl
     tables["topology"] = {**tables["topology"], "delay_s": math.ceil(plan.delay_s / period) * period}
     if plan.bad_s > 0.0:
         tables["channel"] = {"good_s": max(plan.good_s, period), "bad_s": max(plan.bad_s, period)}
-    tables["disturbance"] = [
-        {"on": "input", "shape": "uniform", "amplitude_mps2": plan.input_mps2},
-        {"on": "resistance", "shape": "constant", "error_percent": percent},
-    ]
-    if law.CLOCK == "sampled":
-        tables["disturbance"].append({"on": "measurement", "shape": "uniform", "amplitude_m": plan.measured_m})
-    else:
+    tables["disturbance"] = []
+    if plan.input_mps2 > 0.0:
+        tables["disturbance"].append({"on": "input", "shape": "uniform", "amplitude_mps2": plan.input_mps2})
+    if plan.resistance_scatter > 0.0:
+        tables["disturbance"].append({"on": "resistance", "shape": "constant", "error_percent": percent})
+    if law.CLOCK != "sampled":
         tables["topology"]["communication_period_s"] = 1.0
+    elif plan.measured_m > 0.0:
+        tables["disturbance"].append({"on": "measurement", "shape": "uniform", "amplitude_m": plan.measured_m})
     return tables
 
 
@@ -193,24 +204,38 @@ class Unwatched(Record):
     """Of stops side by side nothing is recorded, and no alarm is raised: ``Watch`` looks."""
 
     def relinked(self, t: float, scene: Any, formed: Any, s: Any) -> None:
-        """Nobody is told."""
+        """Nothing is reported."""
 
     def tell(self, row: Any, ways: Any, here: Any, due: bool, s: Any) -> None:
-        """Nobody is told."""
+        """Nothing is reported."""
 
     def waits(self, t: float, here: Any, speed: Any, traffic: Any, around: Any, due: Any, s: Any) -> None:
-        """Nobody waits."""
+        """No train waits."""
 
 
-def unwatched(p: Model) -> Loop:
-    """The closed loop of a scenario without a simulator, of which nothing is kept."""
+def unwatched(p: Model, world: World | None = None) -> Loop:
+    """The closed loop of a scenario of which nothing is kept, without a simulator unless ``world`` is one."""
     from trainctl.loop import Loop
     from trainctl.numeric import Numeric
 
     journal = cast("Journal", Silent())
-    loop = Loop(p, Numeric(p.line), journal)
+    loop = Loop(p, world or Numeric(p.line), journal)
     loop.record = Unwatched(p, journal)
     return loop
+
+
+@contextmanager
+def sumo(p: Model, folder: Path) -> Iterator[World]:
+    """SUMO for this scenario; its files lie in ``folder`` while the block runs. There is one at a time in a process."""
+    from trainctl.runner import open_world
+    from trainctl.sumo.idling import silent
+
+    with tempfile.TemporaryDirectory(dir=folder, prefix="sumo-") as place, silent():  # it warns of every contact
+        world = open_world(p, Path(place), "sumo")
+        try:
+            yield world
+        finally:
+            world.close()
 
 
 def prepared(plan: StopsPlan, row: str, spacing: float, stops: Sequence[int], folder: Path) -> Model:
@@ -224,37 +249,31 @@ def prepared(plan: StopsPlan, row: str, spacing: float, stops: Sequence[int], fo
     return open_scenario(str(file))
 
 
-def stopped(plan: StopsPlan, row: str, spacing: float, stops: Sequence[int], folder: Path) -> tuple[Outcome, Loop | None]:
-    """Run these stops side by side; what came of them, and the loop at its end."""
+def stopped(
+    plan: StopsPlan, row: str, spacing: float, stops: Sequence[int], folder: Path, in_sumo: bool = False
+) -> tuple[Outcome, Loop | None]:
+    """Run these stops side by side, without a simulator or in SUMO; what came of them, and the loop at its end."""
     try:
         p = prepared(plan, row, spacing, stops, folder)
     except InputError as error:
         return Outcome(spacing, REFUSED, 0, len(stops), 0, math.inf, error.mistakes[0].partition(": ")[2]), None
-    loop = unwatched(p)
-    watch = Watch(plan, p, len(stops))
+    if not in_sumo:
+        return _run(plan, unwatched(p), spacing, stops)
+    with sumo(p, folder) as world:
+        return _run(plan, unwatched(p, world), spacing, stops)
+
+
+def _run(plan: StopsPlan, loop: Loop, spacing: float, stops: Sequence[int]) -> tuple[Outcome, Loop]:
+    watch = Watch(plan, loop.p, len(stops))
     try:
         while not loop.over and not watch.over(loop):
             loop.step()
     except LawError as error:
         return Outcome(spacing, UNSAFE, len(stops), len(stops), int(watch.touched.sum()), watch.gap, str(error)), loop
-    return _outcome(spacing, stops, watch.touched, watch.touched | watch.fast, watch.gap), loop
-
-
-def _outcome(spacing: float, stops: Sequence[int], touched: Bools, failed: Bools, gap: float) -> Outcome:
+    failed = watch.touched | watch.fast
     numbers = tuple(k for k, wrong in zip(stops, failed.tolist(), strict=True) if wrong)
     what = UNSAFE if numbers else SAFE
-    return Outcome(spacing, what, len(numbers), len(stops), int(touched.sum()), gap, "", numbers)
-
-
-def in_sumo(plan: StopsPlan, row: str, spacing: float, stops: Sequence[int], folder: Path) -> Outcome:
-    """The same stops with SUMO moving the trains, told from the log of the run in ``folder``."""
-    from trainctl import runner
-
-    run = runner.run(prepared(plan, row, spacing, stops, folder), folder / "sumo", "sumo", True)
-    rows = run.trains.groupby("train", observed=True).agg(gap=("gap_m", "min"), speed=("speed_mps", "max"))
-    number = np.array([int(name.partition(".")[0]) for name in rows.index])
-    gap, speed = (np.array([rows[key][number == k].agg(how) for k in stops]) for key, how in (("gap", "min"), ("speed", "max")))
-    return _outcome(spacing, stops, gap < 0.0, (gap < 0.0) | (speed > plan.line_mps + ROUNDING_MPS), float(gap.min()))
+    return Outcome(spacing, what, len(numbers), len(stops), int(watch.touched.sum()), watch.gap, "", numbers), loop
 
 
 class Watch:

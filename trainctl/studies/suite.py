@@ -1,11 +1,12 @@
 """Every law in every situation: what happens to formations, in how many of some runs it goes wrong, with intervals, in one table.
 
-The trains are those of ``studies.stops``: brakes, resistance, errors of the start, forces nobody knows of and errors of
+The trains are those of ``studies.stops``: brakes, resistance, errors of the start, unknown forces and errors of
 measurement differ from run to run, messages are late and some get lost. In each situation one thing happens besides. The runs of
 a cell go side by side, each on a track of its own (with another one beside it where trains leave or join), in one closed loop
 without a simulator.
 
-A run fails if two trains touch or one is faster than the line. What is random in it is a function of its number and of the seed.
+A run fails if two trains touch or one is faster than the line. The first run of every cell is run in SUMO as well. What is random
+in a run is a function of its number and of the seed.
 """
 
 from __future__ import annotations
@@ -27,11 +28,12 @@ from trainctl.record.folder import write_json
 from trainctl.signals import POSITION, SPEED
 from trainctl.studies.capacity import BAND_MPS, LAW_ROWS
 from trainctl.studies.results import wilson
-from trainctl.studies.stops import REFUSED, ROUNDING_MPS, ROWS, StopsPlan, scenario, unwatched
+from trainctl.studies.stops import REFUSED, ROUNDING_MPS, ROWS, StopsPlan, scenario, sumo, unwatched
 
 if TYPE_CHECKING:
     from trainctl.loop import Loop
-    from trainctl.signals import Floats
+    from trainctl.scenario.model import Model
+    from trainctl.signals import Bools, Floats
 
 Tables = dict[str, Any]
 
@@ -43,6 +45,9 @@ MIDDLE = 3
 
 #: Share of power and brakes a train has left that has lost one unit of four.
 LEFT = 0.75
+
+#: By how much masses are not as stated [%].
+MASS_OFF = 5.0
 
 
 class SuitePlan(NamedTuple):
@@ -65,6 +70,11 @@ class Cell(NamedTuple):
     gap_m: float | None  # minimum of all
     error_m: float | None  # largest error of a spacing at the end: the median of the runs
     jerk_rms_mps3: float | None  # median of the runs
+    contacts: int = 0  # of those that failed: trains touched
+    faster_mps: float | None = None  # by how much the fastest train of all was faster than the line; below 0: nobody was
+    first_gap_m: float | None = None  # minimum of the first run
+    sumo_gap_m: float | None = None  # the same where SUMO moved the trains
+    sumo_failed: bool | None = None  # whether the first run failed there; None: it was not run
 
     def plain(self) -> dict[str, Any]:
         """For machines, with the interval of the share that failed."""
@@ -111,11 +121,19 @@ def _gradient(tables: Tables, line: Tables, runs: int) -> None:
 
 
 def _unit_lost(tables: Tables, line: Tables, runs: int) -> None:
-    """The first train brakes as in service; one in the middle lacks a quarter of its power and brakes, and nobody knows."""
+    """The first train brakes as in service; one in the middle lacks a quarter of its power and brakes, and no law knows."""
     _stop(tables, line, runs)
     for name, kind in tables["train_type"].items():
         if name.endswith(f".{MIDDLE}"):
             kind |= {key: LEFT * kind[key] for key in ("traction_n", "traction_power_w", "braking_n")}
+
+
+def _mass_off(tables: Tables, line: Tables, runs: int) -> None:
+    """The first train brakes as in service; every train is 5 % heavier or lighter than stated, and no law knows."""
+    _stop(tables, line, runs)
+    for name, kind in tables["train_type"].items():
+        k, i = (int(part) for part in name[1:].split("."))
+        kind["mass_error_percent"] = float(np.random.default_rng([tables["run"]["seed"], k, i]).choice((-1.0, 1.0)) * MASS_OFF)
 
 
 def _leave(tables: Tables, line: Tables, runs: int) -> None:
@@ -155,7 +173,7 @@ def _beside(tables: Tables, line: Tables, runs: int, way: int) -> None:
 
 SITUATIONS: Mapping[str, Callable[[Tables, Tables, int], None]] = {
     "calm": _calm, "join": _join, "leave": _leave, "stop": _stop, "emergency_stop": _emergency_stop, "outage": _outage,
-    "bursts": _bursts, "gradient": _gradient, "unit_lost": _unit_lost,
+    "bursts": _bursts, "gradient": _gradient, "mass_off": _mass_off, "unit_lost": _unit_lost,
 }  # fmt: skip
 
 
@@ -179,46 +197,71 @@ def tables_of(plan: SuitePlan, row: str, situation: str) -> tuple[Tables, Tables
 
 
 def cell(plan: SuitePlan, row: str, situation: str, folder: Path) -> Cell:
-    """Run a cell; its files lie in ``folder``."""
-    from trainctl.scenario.build import open_scenario
-
+    """Run a cell, and its first run in SUMO as well; its files lie in ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
-    tables, line = tables_of(plan, row, situation)
-    (folder / "line.toml").write_text(tomli_w.dumps(line), encoding="utf-8")
-    file = folder / "scenario.toml"
-    file.write_text(tomli_w.dumps({**tables, "network": {"line": "line.toml"}}), encoding="utf-8")
     try:
-        p = open_scenario(str(file))
+        p = _prepared(plan, row, situation, folder)
     except InputError as error:
         return Cell(row, situation, REFUSED, error.mistakes[0].partition(": ")[2], 0, plan.runs, None, None, None)
-    loop = unwatched(p)
-    of = np.array([int(name.partition(".")[0]) for name in p.scenario.ids])
-    gap, fast, speeds = np.full(plan.runs, np.inf), np.zeros(plan.runs, bool), list[Any]()
     try:
-        while not loop.over:
-            loop.step()
-            _take_in(loop, of, gap, fast, plan.stops.line_mps)
-            speeds.append(loop.state.own[p.leading, SPEED].copy())
+        ran = _ran(unwatched(p), plan)
     except (LawError, InputError) as error:
         return Cell(row, situation, "run", str(error), plan.runs, plan.runs, None, None, None)
-    failed = (gap < 0.0) | fast
-    jerk = np.square(np.diff(np.array(speeds), 2, axis=0) / p.scenario.run.step_s**2).mean(axis=0)
-    jerks = np.sqrt(np.bincount(of, jerk) / np.bincount(of))
-    return Cell(
-        row, situation, "run", "", int(failed.sum()), plan.runs, float(gap.min()), float(np.median(_errors(loop, of))),
-        float(np.median(jerks)),
+    found = Cell(
+        row, situation, "run", "", int(ran.failed.sum()), plan.runs, float(ran.gap.min()), float(np.median(ran.error)),
+        float(np.median(ran.jerk)), int((ran.gap < 0.0).sum()), float(ran.faster.max()), float(ran.gap[0]),
     )  # fmt: skip
+    first = _prepared(plan._replace(runs=1), row, situation, folder)
+    with sumo(first, folder) as world:
+        there = _ran(unwatched(first, world), plan._replace(runs=1))
+    return found._replace(sumo_gap_m=float(there.gap[0]), sumo_failed=bool(there.failed[0]))
 
 
-def _take_in(loop: Loop, of: Any, gap: Floats, fast: Any, top: float) -> None:
-    """The present instant: gaps to the train ahead in each formation, and who is too fast; of runs that touched nothing more."""
+def _prepared(plan: SuitePlan, row: str, situation: str, folder: Path) -> Model:
+    """The scenario of a cell, checked."""
+    from trainctl.scenario.build import open_scenario
+
+    tables, line = tables_of(plan, row, situation)
+    name = "scenario" if plan.runs > 1 else "first"
+    (folder / f"{name}_line.toml").write_text(tomli_w.dumps(line), encoding="utf-8")
+    file = folder / f"{name}.toml"
+    file.write_text(tomli_w.dumps({**tables, "network": {"line": f"{name}_line.toml"}}), encoding="utf-8")
+    return open_scenario(str(file))
+
+
+class Ran(NamedTuple):
+    """What came of runs side by side, one number for each."""
+
+    failed: Bools
+    gap: Floats  # m, minimum
+    faster: Floats  # m/s, the fastest train less the line's speed
+    error: Floats  # m, largest of a spacing at the end
+    jerk: Floats  # m/s3, root mean square
+
+
+def _ran(loop: Loop, plan: SuitePlan) -> Ran:
+    """Run a cell's loop to its end."""
+    p = loop.p
+    of = np.array([int(name.partition(".")[0]) for name in p.scenario.ids])
+    gap, faster, speeds = np.full(plan.runs, np.inf), np.full(plan.runs, -np.inf), list[Any]()
+    while not loop.over:
+        loop.step()
+        _take_in(loop, of, gap)
+        np.maximum.at(faster, of, loop.state.own[p.leading, SPEED] - plan.stops.line_mps)
+        speeds.append(loop.state.own[p.leading, SPEED].copy())
+    jerk = np.square(np.diff(np.array(speeds), 2, axis=0) / p.scenario.run.step_s**2).mean(axis=0)
+    failed = (gap < 0.0) | (faster > ROUNDING_MPS)
+    return Ran(failed, gap, faster, _errors(loop, of), np.sqrt(np.bincount(of, jerk) / np.bincount(of)))
+
+
+def _take_in(loop: Loop, of: Any, gap: Floats) -> None:
+    """The present instant: gaps to the train ahead in each formation; of runs that touched nothing more."""
     own, ahead, length = loop.state.own[loop.p.leading], loop.state.formed.ahead, loop.p.consists.train_length()
     follows = np.flatnonzero(ahead >= 0)
     gaps = own[ahead[follows], POSITION] - length[ahead[follows]] - own[follows, POSITION]
     touched = gap < 0.0
     live = ~touched[of[follows]]
     np.minimum.at(gap, of[follows][live], gaps[live])
-    np.logical_or.at(fast, of, own[:, SPEED] > top + ROUNDING_MPS)
 
 
 def _errors(loop: Loop, of: Any) -> Floats:

@@ -31,6 +31,15 @@ def grid(cells: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[str], dict
     return list(dict.fromkeys(row for row, _ in known)), list(dict.fromkeys(name for _, name in known)), known
 
 
+def confirmed(cells: Sequence[Mapping[str, Any]]) -> str:
+    """What SUMO says of the first runs of the cells, in words."""
+    ran = [cell for cell in cells if cell["sumo_failed"] is not None]
+    if not ran:
+        return "No cell was run in SUMO."
+    off = max(abs(cell["sumo_gap_m"] - cell["first_gap_m"]) for cell in ran)
+    return f"SUMO moved the trains of one run of each of {len(ran)} cells as well: minimum gaps differ by at most {off:.2g} m."
+
+
 def page(cells: Sequence[Mapping[str, Any]], plan: SuitePlan) -> str:
     """One self-contained page: a row per law, a column per situation, what each situation is, and why cells were refused."""
     rows, names, known = grid(cells)
@@ -44,7 +53,8 @@ def page(cells: Sequence[Mapping[str, Any]], plan: SuitePlan) -> str:
         f"<!doctype html><html lang='en'><meta charset='utf-8'><title>trainctl: the suite</title><style>{STYLE}</style>"
         f"<h1>Laws in situations</h1><p>{plan.stops.trains} trains {plan.spacing_m:g} m apart at {kmh:.3g} km/h, {plan.runs}"
         " runs of each cell. In a cell: runs in which trains touched or one was faster than the line, with the 95 % interval of"
-        " that share; minimum gap; largest error of a spacing at the end and jerk, medians of the runs.</p>"
+        " that share; of these, in how many they touched, and by how much the fastest was too fast; minimum gap; largest error"
+        f" of a spacing at the end and jerk, medians of the runs. {confirmed(cells)}</p>"
         f"<table><tr><th></th>{head}</tr>{body}</table><h2>Situations</h2><ul>{about}</ul>"
         f"{f'<h2>Refused, or failed</h2><ul>{why}</ul>' if why else ''}</html>\n"
     )
@@ -57,7 +67,8 @@ def _text(name: str) -> str:
 def _cell(cell: Mapping[str, Any]) -> str:
     if cell["what"] == REFUSED or cell["gap_m"] is None:
         return f"<td class='refused'>{words(cell)}</td>"
-    more = f"gap {cell['gap_m']:.4g} m<br>error {cell['error_m']:.3g} m<br>jerk {cell['jerk_rms_mps3']:.2g} m/s³"
+    why = f"touched {cell['contacts']}, too fast by {max(cell['faster_mps'], 0.0):.2g} m/s<br>" if cell["failed"] else ""
+    more = f"{why}gap {cell['gap_m']:.4g} m<br>error {cell['error_m']:.3g} m<br>jerk {cell['jerk_rms_mps3']:.2g} m/s³"
     return f"<td class='{'bad' if cell['failed'] else 'good'}'>{words(cell)}<small>{more}</small></td>"
 
 

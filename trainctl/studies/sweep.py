@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from sumo_net.bounded import short_text
-from trainctl.errors import InputError
+from trainctl.errors import InputError, TrainctlError
 from trainctl.scenario.reading import examine, find, read, shipped
 from trainctl.studies.blocks import blocks, refusal, simulate_block
 from trainctl.studies.jobs import Batch, Job, job_model, simulate
@@ -410,13 +410,14 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
             with client:
                 yield client
             return
-        with (
-            LocalCluster(  # type: ignore[no-untyped-call]
+        try:
+            cluster = LocalCluster(  # type: ignore[no-untyped-call]
                 n_workers=workers, threads_per_worker=1, processes=True, memory_limit=0, silence_logs=50,
-                host="127.0.0.1", dashboard_address="127.0.0.1:0",  # nobody else's business
-            ) as cluster,
-            Client(cluster, set_as_default=False) as client,  # type: ignore[no-untyped-call]
-        ):  # fmt: skip
+                host="127.0.0.1", dashboard_address="127.0.0.1:0",  # not to be reached from elsewhere
+            )  # fmt: skip
+        except (RuntimeError, OSError) as error:
+            raise TrainctlError(f"workers could not be started on 127.0.0.1, is the loopback up? {error}") from None
+        with cluster, Client(cluster, set_as_default=False) as client:  # type: ignore[no-untyped-call]
             yield client
 
 

@@ -70,7 +70,7 @@ class Baseline(Session):
 
     @property
     def over(self) -> bool:
-        """Whether every train has left, and nobody is still to come."""
+        """Whether every train has left, and none is still to come."""
         return bool(libsumo.simulation.getMinExpectedNumber() <= 0)
 
     def start(self) -> None:

@@ -1,4 +1,4 @@
-"""Why SUMO did something else with a train than it was told to, in words."""
+"""Why SUMO moved a train otherwise than commanded, in words."""
 
 from __future__ import annotations
 

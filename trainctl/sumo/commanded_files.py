@@ -52,7 +52,7 @@ def write_routes(start: Start, path: Path, obeyed: Obeyed | None = None) -> list
     """The trains as SUMO vehicles: true lengths and carriages, no randomness, no limits of SUMO's own.
 
     Those that come later have their types here and are added when they come. Returns the type of every train. Where signals are
-    ``obeyed`` a type brakes as its trains do, and SUMO lets nobody in before the block is free.
+    ``obeyed`` a type brakes as its trains do, and SUMO lets no train in before the block is free.
     """
     types: dict[tuple[str, tuple[float, ...], str], str] = {}
     taken = set() if obeyed is None else set(re.findall(r'<vType [^>]*id="([^"]*)"', "".join(obeyed.handed.types)))

@@ -10,7 +10,7 @@ from sumo_net import Line
 
 
 def objections(line: Line, step: float) -> list[str]:
-    """Every reason why SUMO would not do what it is told; empty if there is none."""
+    """Every reason why SUMO would not do what is commanded; empty if there is none."""
     found = []
     versions = {}
     for package in ("libsumo", "eclipse-sumo"):

@@ -1,4 +1,4 @@
-"""A finished run shown again: SUMO moves the trains as they were recorded, nothing is computed anew."""
+"""A finished run replayed: SUMO moves the trains as they were recorded, nothing is computed anew."""
 
 from __future__ import annotations
 
@@ -21,6 +21,9 @@ from trainctl.scenario.tables import Scenario
 from trainctl.signals import Bools, Floats, Ints, Links, Start
 from trainctl.sumo.gui import Gui, Map
 from trainctl.topology import graph
+
+#: A train that is slower stands [m/s].
+STANDS_MPS = 1e-6
 
 
 def replay(run: Run, binary: str = "sumo-gui", from_s: float = 0.0, delay_ms: float = 20.0) -> int:
@@ -49,10 +52,6 @@ def replay(run: Run, binary: str = "sumo-gui", from_s: float = 0.0, delay_ms: fl
     SimulatorError
         SUMO could not be started, or the window was closed.
     """
-    if turned := sorted({str(event["train"]) for event in run.events if event["kind"] == "turn"}):
-        raise InputError(
-            f"{run.folder}: trains turn back in it ({', '.join(turned[:8])}), which is not shown again: watch a run with --gui"
-        )
     scenario, _ = examine(run.scenario, resolved=True)
     if scenario is None:
         raise InputError(f"{run.folder}: its scenario.toml is damaged")
@@ -117,12 +116,16 @@ def _traffic(run: Run, scenario: Scenario, binary: str, from_s: float, delay_ms:
     places = seen.drop_duplicates("train").set_index("train").loc[ids]
     kept = [scenario.ids.index(name) for name in ids]
     consists = scenario.consists()
-    ways = [_way(rails, edge[there[:, i], i].tolist()) for i in range(len(ids))]
+    legs = [_legs(rails, edge[:, i], speed[:, i]) for i in range(len(ids))]
+    lengths = consists.train_length()[kept]
+    # What a train turns on it must be able to run back over, whether it has done so or not.
+    ways = [_run_back(rails, [_way(rails, leg) for _, leg in own], float(n)) for own, n in zip(legs, lengths, strict=True)]
+    turns = {(k, i): way for i, own in enumerate(legs) for (k, _), way in zip(own[1:], ways[i][1:], strict=True)}
     start = Start(
-        ids=ids, edge=np.array([way[0] for way in ways]), lane_position=places["m"].to_numpy(), speed=speed[first, range(len(ids))],
-        length=consists.train_length()[kept],
+        ids=ids, edge=np.array([own[0][0] for own in ways]), lane_position=places["m"].to_numpy(),
+        speed=speed[first, range(len(ids))], length=lengths,
         unit_length=[consists.length[consists.first[k] : consists.first[k + 1]] for k in kept],
-        routes=[tuple(rails.edges[e] for e in way) for way in ways], present=first == 0, vclass=["rail"] * len(ids),
+        routes=[tuple(rails.edges[e] for e in own[0]) for own in ways], present=first == 0, vclass=["rail"] * len(ids),
     )  # fmt: skip
     position = _grid(run.trains, "position_m", ids, times)
     links = _changes(run, times, ids, np.zeros_like(edge), np.nan_to_num(position, nan=-np.inf))
@@ -137,12 +140,42 @@ def _traffic(run: Run, scenario: Scenario, binary: str, from_s: float, delay_ms:
                     gui.linked(*_formations(links[now][0]))
                 for i in np.flatnonzero(first == k + 1).tolist():
                     gui.insert(i, float(speed[k + 1, i]))
+                turned = [i for i in range(len(ids)) if (k, i) in turns]
+                for i in turned:
+                    gui.turn(i, tuple(rails.edges[e] for e in turns[k, i]), np.inf)
                 # Who is gone by the next instant has left at the end of its way.
                 gone = np.where(there[k], np.nan_to_num(speed[k]) * step + float(rails.length_m.max()), 0.0)
-                gui.move(np.where(there[k] & there[k + 1], np.nan_to_num(speed[k + 1]) * step, gone), step)
+                moves = np.where(there[k] & there[k + 1], np.nan_to_num(speed[k + 1]) * step, gone)
+                moves[turned] = 0.0
+                gui.move(moves, step)
         finally:
             gui.close()
     return len(times) - 1
+
+
+def _legs(rails: Rails, edge: Ints, speed: Floats) -> list[tuple[int, list[int]]]:
+    """The edges (-1: none) that a train was seen on at every instant, one part for each turn, with the instant before its turn.
+
+    A train that has turned stands, and is on track that it has come over.
+    """
+    there = np.flatnonzero(edge >= 0).tolist()
+    legs: list[tuple[int, list[int]]] = [(there[0], [int(edge[there[0]])])]
+    for before, k in pairwise(there):
+        leg, here = legs[-1][1], int(edge[k])
+        if here != leg[-1] and speed[k] < STANDS_MPS and here in {int(rails.twin[e]) for e in leg}:
+            legs.append((before, [int(rails.twin[leg[-1]])]))
+        legs[-1][1].append(here)
+    return legs
+
+
+def _run_back(rails: Rails, legs: list[list[int]], length: float) -> list[list[int]]:
+    """The legs of a train, each after a turn as long as the train, if need be on along the track that it has come over."""
+    for leg, onward in pairwise(legs):
+        back = [int(rails.twin[e]) for e in reversed(leg)]
+        if onward == back[: len(onward)]:
+            under = int(np.searchsorted(np.cumsum(rails.length_m[back]), length + rails.length_m[back[0]])) + 1
+            onward += [e for e in back[len(onward) : under] if e >= 0]
+    return legs
 
 
 def _way(rails: Rails, seen: list[int]) -> list[int]:

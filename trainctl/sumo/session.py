@@ -28,7 +28,7 @@ from trainctl.sumo.preflight import objections
 from trainctl.sumo.signal_box import Box, Obeyed
 from trainctl.traffic.trial import tried_as_a_whole
 
-#: What SUMO adds in one step is exact to rounding; anything beyond was somebody else.
+#: What SUMO adds in one step is exact to rounding; anything beyond has another cause.
 TOLERANCE_M = 1e-6
 
 #: Closer than this to the end of its edge a train may be on the next one.
@@ -307,12 +307,17 @@ class Sumo(Session):
         """Let a train that stands leave its lane, by a stop without an end, or come back to it."""
         name, vehicle = self.ids[train], self.api.vehicle
         if not off:
-            self._call(vehicle.resume, name)
+            self._call(vehicle.setStopParameter, name, 0, "duration", "0")
             self.returning.append(train)
             return
         if self.idle:  # a driver that never decides does not see his stop
             self._call(vehicle.setActionStepLength, name, self.time_step)
         self._stop_here(name, PARKING)
+
+    def claim(self, claims: list[list[int]]) -> None:
+        """Say which trains hold which signals from now on."""
+        if self.box is not None:
+            self.box.claims = claims
 
     def halt(self, train: int, stands: bool) -> None:
         """Let SUMO know where signals are obeyed that a train stands at a stop: it asks for no signal meanwhile."""
@@ -338,7 +343,7 @@ class Sumo(Session):
         self.turning.append((train, edges, arrival))
 
     def linked(self, links: Links, formation: Ints) -> None:
-        """Nobody looks."""
+        """Nothing is shown."""
 
     def move(self, displacement: Floats, step: float) -> None:
         """Command the mean speed of the step, displacement / T: SUMO's Euler update then moves the train by just that."""
@@ -353,6 +358,8 @@ class Sumo(Session):
         if self.idle:
             for i in np.flatnonzero(present & (left < PLANNED_M)).tolist():
                 self._call(self._plan, self.ids[i], 0.0)
+        if self.box is not None:
+            self.box.hold()
         for i in self.pending.keys() - {i for i, _ in self.coming}:  # these are not to come now
             self._call(self.api.vehicle.remove, self.ids[i])
             del self.pending[i]
@@ -368,13 +375,25 @@ class Sumo(Session):
         wrong = np.flatnonzero(np.abs(now.position - wanted) > TOLERANCE_M)
         if len(wrong):
             raise CouplingError("; ".join(self._explain(int(i), now, before, displacement) for i in wrong[:5]))
-        for i in self.returning:
-            if not self.api.vehicle.getLaneID(self.ids[i]):
-                raise CouplingError(f"train {self.ids[i]} is parked; SUMO does not let it back at {self.now():.3f} s")
-        self.returning.clear()
+        self._returned()
         if self.coming:
             now.present[self._verify_insertion()] = True
         self.seen = now if own is None else own.within(now, self.ways)
+
+    def _returned(self) -> None:
+        """See who has come back from where it was parked, and end its stop; the others are parked on."""
+        vehicle, kept = self.api.vehicle, []
+        for i in self.returning:
+            if vehicle.getLaneID(self.ids[i]):
+                self._call(vehicle.resume, self.ids[i])
+            else:
+                kept.append(i)
+                self._call(vehicle.setStopParameter, self.ids[i], 0, "duration", repr(PARKS_S))
+        self.returning.clear()
+        if self.box is not None:
+            self.box.parked = kept
+        elif kept:
+            raise CouplingError(f"train {self.ids[kept[0]]} is parked; SUMO does not let it back at {self.now():.3f} s")
 
     def _inside(self, train: int, edges: tuple[str, ...]) -> float:
         """Length of the junctions under a train once it has turned [m]."""

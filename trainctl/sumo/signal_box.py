@@ -1,7 +1,7 @@
 """SUMO as a signal box: rail signals that trains of ours obey, and trains of SUMO's own among them.
 
 Of whoever obeys SUMO's driver plans every step, so that it asks for signals, with the deceleration the train brakes with; what that
-driver wants is overruled all the same. SUMO lets nobody in before the block is free.
+driver wants is overruled all the same. SUMO lets no train in before the block is free.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from sumo_net import Rails
     from trainctl.sumo.session import Session
 
+#: A trip that nobody makes.
+NOBODY = "(nobody)"
+
 #: Options of ours that do not hold where trains of SUMO's run, or are let in as SUMO does it.
 NOT_WITH_SIGNALS = ("insertion-checks", "default.speeddev")
 
@@ -36,7 +39,7 @@ class Obeyed(NamedTuple):
 
 
 def obeyed(p: Model) -> Obeyed | None:
-    """The same of a scenario; None where nobody obeys signals."""
+    """The same of a scenario; None where signals are not obeyed."""
     handed = p.roster.handed
     if handed is None:
         return None
@@ -77,6 +80,9 @@ class Box:
         self.own = np.flatnonzero(obeyed.driven)
         self.speed = np.full(len(session.ids), np.nan)
         self.state = session.api.trafficlight.getRedYellowGreenState
+        self.parked: list[int] = []
+        self.claims: list[list[int]] = []
+        self.held: dict[tuple[int, int], set[tuple[str, str]]] = {}  # for each claim: signal and trip of those it holds
 
     def green(self, signals: Ints) -> Bools:
         """Whether signals show green, by their numbers."""
@@ -98,6 +104,31 @@ class Box:
                 if train in self.number:
                     return self.number[train]
         return -1
+
+    def hold(self) -> None:
+        """Before SUMO sets its signals: whoever might be given what a claimed signal gives is to wait, by a constraint.
+
+        It is told to let a train pass first that does not exist, so it waits until the constraint is taken off.
+        """
+        lights, claims = self.session.api.trafficlight, {(i, q) for i, q in self.claims}
+        for claim in self.held.keys() - claims:
+            for at, trip in sorted(self.held.pop(claim)):
+                lights.removeConstraints(at, trip, self.obeyed.signals[claim[1]][0], NOBODY)
+        for claim in sorted(claims):
+            name, link = self.obeyed.signals[claim[1]]
+            held = self.held.setdefault(claim, set())
+            for rival in lights.getRivalVehicles(name, link):
+                ahead = self.session.api.vehicle.getNextTLS(rival)
+                red = [one[0] for one in ahead if one[3] not in "Gg"]  # one that has just come has green until it is asked for
+                trip = self.obeyed.handed.trips[self.number[rival]] if rival in self.number else rival
+                for at in (red or [one[0] for one in ahead])[:1]:
+                    if (at, trip) not in held:
+                        held.add((at, trip))
+                        lights.addConstraint(at, trip, name, NOBODY, 0, 1)
+
+    def kept_parked(self) -> list[int]:
+        """Trains that were to come back with the last move, and are parked still."""
+        return self.parked
 
     def speeds(self) -> Floats:
         """Speeds of the trains that SUMO drives [m/s], NaN of the others."""

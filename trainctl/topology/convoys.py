@@ -2,7 +2,7 @@
 
 A formation is a chain of coupled trains. It forms link by link: a train whose route leads behind another one draws near until
 the law may take over, then it couples; it uncouples when another train comes between, when its way branches off, and when it has
-to stop. So the order at a join of tracks is that of the trains that come, and nobody has to know the net.
+to stop. So the order at a join of tracks is that of the trains that come, and no train has to know the net.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def broken(ahead: Ints, next_ahead: Ints, willing: Bools) -> Ints:
 
 
 def candidates(ahead: Ints, next_ahead: Ints, next_behind: Ints, willing: Bools) -> Ints:
-    """Trains that could couple to the next one ahead: both willing, and nobody nearer to it."""
+    """Trains that could couple to the next one ahead: both willing, and none nearer to it."""
     free = np.flatnonzero((ahead < 0) & (next_ahead >= 0) & willing)
     other = next_ahead[free]
     free = free[willing[other] & (next_behind[other] == free)]

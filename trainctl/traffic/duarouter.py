@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -18,6 +19,12 @@ from trainctl.traffic.files import PLACES, Elements, parse, seconds
 
 #: Seconds after which duarouter is taken for stuck.
 PATIENCE_S = 300.0
+
+#: Options of a configuration that decide which way a trip takes.
+ROUTING = (
+    "railway.max-train-length", "weights.reversal-penalty", "weights.turnaround-penalty", "weights.minor-penalty",
+    "weights.priority-factor",
+)  # fmt: skip
 
 #: What duarouter needs of a train.
 _TRAIN_KEYS = {
@@ -31,9 +38,10 @@ _STOP_KEYS = {"lane", "edge", "startPos", "endPos", "friendlyPos", "duration", "
 
 
 def expand(
-    trains: list[Element], elements: Elements, net: Path, work: Path, begin: float, end: float | None, seed: int
-) -> list[Element]:
-    """The vehicles duarouter makes of the trains."""
+    trains: list[Element], elements: Elements, net: Path, work: Path, begin: float, end: float | None, seed: int,
+    routing: Mapping[str, str],
+) -> list[Element]:  # fmt: skip
+    """The vehicles duarouter makes of the trains; ``routing`` are the options of ``ROUTING`` that are said."""
     work.mkdir(parents=True, exist_ok=True)
     more, routes = Element("additional"), Element("routes")
     more.extend(elements.places.values())
@@ -65,6 +73,7 @@ def expand(
         "begin": f"{begin:.3f}", "seed": str(seed), "precision": "9", "xml-validation": "never", "no-step-log": "true",
         "unsorted-input": "true", "ignore-errors": "true",
         "skip-new-routes": "true",  # otherwise it draws between the route a train is given and a shorter one
+        **routing,
     }  # fmt: skip
     if any(key.endswith(("Junction", "Junctions")) for train in trains for key in train.keys()):  # noqa: SIM118
         options["junction-taz"] = "true"

@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element
 
 from sumo_net.netfile import NetFile
 
-#: Why what nobody thought of is not followed.
+#: Why what is not known here is not followed.
 UNKNOWN = "it is not known here"
 
 
@@ -33,6 +33,7 @@ OFF = frozenset(("", "0", "false", "False", "off", "no", "-1", "none", "0.0", "0
 OPTIONS = _words(
     "net-file route-files additional-files begin end scale scale-suffix max-depart-delay use-stop-ended",
     "default.departspeed",
+    "railway.max-train-length weights.reversal-penalty weights.turnaround-penalty weights.minor-penalty weights.priority-factor",
     "railsignal-moving-block",  # where signals are obeyed, see of_signals
 )
 
@@ -146,18 +147,18 @@ NAMED: Mapping[tuple[str, str], tuple[str, frozenset[str]] | Refused] = {
         }.items()
     },
     ("stop", "parking"): ("the train stays on its track, and others wait for it", OFF | _words("true 1 yes on x t True")),
-    ("stop", "triggered"): ("nobody boards; a train stands as long as duration and until say", OFF),
+    ("stop", "triggered"): ("no passengers board; a train stands as long as duration and until say", OFF),
     ("stop", "containerTriggered"): ("nothing is loaded; a train stands as long as duration and until say", OFF),
     ("stop", "join"): Refused("trains are not joined; take the stop and the train that joins out of the files"),
     ("stop", "split"): Refused("trains are not split; take the stop's split and the train it names out of the files"),
     ("stop", "jump"): Refused("a train cannot jump to its next edge; give it a route there"),
     ("stop", "jumpUntil"): ("trains do not jump", OFF),
     ("stop", "started"): ("a stop begins when the train stands", OFF),
-    ("stop", "onDemand"): ("nobody waits or boards; the train stops", OFF),
+    ("stop", "onDemand"): ("no passengers wait or board; the train stops", OFF),
     ("stop", "index"): ("stops are made in the order of the file", _words("end fit")),
-    ("stop", "extension"): ("nobody is waited for", OFF),
+    ("stop", "extension"): ("the train does not wait for others", OFF),
     ("parkingArea", "roadsideCapacity"): ("trains park at its end, whichever place is free", _words("0 1")),
-    ("parkingArea", "onRoad"): ("who stops there leaves the track", OFF),
+    ("parkingArea", "onRoad"): ("a train that stops there leaves the track", OFF),
     ("vType", "scale"): ("every train of it comes once", _words("1 1.0 1.00")),
     **{
         ("vType", key): ("train type and law of the scenario drive the train", frozenset[str]())
@@ -169,7 +170,7 @@ NAMED: Mapping[tuple[str, str], tuple[str, frozenset[str]] | Refused] = {
 #: Whole elements of route and additional files that are not followed, in which words.
 ELEMENTS_NAMED: Mapping[str, str | Refused] = {
     "calibrator": "no train is let in or taken out by it",
-    "vaporizer": "nobody is taken out by it",
+    "vaporizer": "no train is taken out by it",
     "overheadWire": "overhead wires are not modelled",
     "tractionSubstation": "overhead wires are not modelled",
     "taz": "trips between zones have no route here",

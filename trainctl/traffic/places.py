@@ -81,7 +81,7 @@ def read_tracks(net: Path) -> Tracks:
 
 
 def unmarked(edges: Iterable[str], tracks: Tracks) -> list[str]:
-    """Edges of routes that are no track by name, but let everybody on."""
+    """Edges of routes that are no track by name, but are open to all classes."""
     lanes = {e.attributes.get("id", ""): e.lanes for e in tracks.file.edges}
     return [e for e in dict.fromkeys(edges) if not any(for_trains(lane) for lane in lanes.get(e, []))]
 

@@ -20,7 +20,7 @@ from trainctl.traffic import crossings
 from trainctl.traffic.checks import not_followed, rail_trains, refuse
 from trainctl.traffic.choices import Choice, choices
 from trainctl.traffic.closings import Closing, closings
-from trainctl.traffic.duarouter import expand
+from trainctl.traffic.duarouter import ROUTING, expand
 from trainctl.traffic.files import (
     PLACES,
     Elements,
@@ -143,6 +143,12 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
     speed = options.get("default.departspeed", DEPART_SPEED)
     if speed not in _WORDS["departSpeed"] and bad_number(speed):
         wrong.append(f"{sumocfg}: default.departspeed = {speed}: must be a speed or one of {', '.join(_WORDS['departSpeed'])}")
+    routing = {key: options[key] for key in ROUTING if key in options}
+    for key, said in routing.items():
+        if not (is_number(said) if key == "weights.reversal-penalty" else not bad_number(said)):
+            wrong.append(
+                f"{sumocfg}: {key} = {said}: must be a number{'' if key == 'weights.reversal-penalty' else ', not negative'}"
+            )
     if wrong:
         raise InputError(wrong)
     begin, own_end = times["begin"], times["end"] if times["end"] >= 0 else None
@@ -177,7 +183,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         notes += scale_notes
     if in_doubt(net[0], tracks.file):
         tried(net[0])
-    expanded = expand(trains, elements, net[0], work, begin, min(ends) if ends else None, seed)
+    expanded = expand(trains, elements, net[0], work, begin, min(ends) if ends else None, seed, routing)
     order = {train.get("id", ""): k for k, train in enumerate(trains)}
     made = {vehicle.get("id", "") for vehicle in expanded}
     made |= {name.rpartition(".")[0] for name in made}
@@ -236,7 +242,7 @@ def _departs(train: Element, begin: float) -> float:
 
 
 def _comes(train: Element, begin: float, end: float) -> bool:
-    """Whether a train, or one of a flow, must depart between these times; of a flow that is drawn nobody can tell."""
+    """Whether a train, or one of a flow, must depart between these times; of a flow that is drawn that is not known."""
     if train.tag != "flow":
         return begin <= _departs(train, begin) < end
     sure = train.get("number", "1") != "0" and "probability" not in train.attrib
@@ -303,7 +309,9 @@ def _departure(
     planned = [_planned(stop, late if k < of_lap else 0.0 if k >= laps * of_lap else None) for k, stop in enumerate(given)]
     wrong = [f"train {name}: {m}" for m in (*unconnected(list(edges), tracks), *off_route(edges, places, firsts))]
     wrong += [f"train {name}: {cut}"] if isinstance(cut, str) else []
-    wrong += [f"train {name}: {m}" for m in (_backwards(given, planned, places) if laps == 1 else [])]
+    # Where a stop is said to have ended, later than planned, what is planned of the next ones may lie before.
+    were_late = any(stop.get("ended") for one in (source, *routes_of(source, elements)) for stop in one.iter("stop"))
+    wrong += [f"train {name}: {m}" for m in (_backwards(given, planned, places) if laps == 1 and not were_late else [])]
     stops = [
         StopElement(
             edge=place.lane.rpartition("_")[0],

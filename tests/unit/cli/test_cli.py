@@ -206,7 +206,7 @@ def test_scenarios_runs_and_keys_are_completed(folder, monkeypatch):
     assert "my.toml" in console.scenario_names("m")
 
 
-@pytest.mark.parametrize("command", ["check", "run", "schema", "sweep", "resume"])
+@pytest.mark.parametrize("command", ["check", "run", "schema", "sweep", "tune", "resume", "compare"])
 def test_help_says_where_a_laws_file_is_executed(command, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["trainctl", command, "--help"])
     with pytest.raises(SystemExit):

@@ -27,6 +27,22 @@ def test_without_the_observer_the_speed_is_wrong() -> None:
     assert string.own[0, 1] < 39.6
 
 
+def test_a_limit_the_law_does_not_know_of_does_not_wind_it_up() -> None:
+    """Half a minute in which nothing that is asked for comes: the observer holds it for a force, up to its bound and not beyond."""
+    string = String(law, law.Params(), scene(2, 500.0))
+    string.own[1, 0] -= 100.0  # it closes up, in vain
+    for _ in range(30):
+        speed = string.own[:, 1].copy()
+        string.step()
+        string.own[:, 1] = np.minimum(string.own[:, 1], speed)
+    assert string.memory[0].z2[1] == -0.15
+    fast = []
+    for _ in range(120):
+        string.step()
+        fast.append(float(string.own[1, 1]))
+    assert max(fast) < 43.0 + 0.01  # the reference, and faster_mps
+
+
 def test_on_the_surface_the_spacing_error_decays_as_it_says() -> None:
     """e' = -c e once S = 0: from 20 m too far, e falls by exp(-c) each second."""
     string = String(law, law.Params(surface_per_s=0.05, reach_mps2=0.5, layer_mps=1.0), scene(2, 500.0))

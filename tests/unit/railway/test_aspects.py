@@ -22,7 +22,10 @@ class Line:
         self.at = aspects.table(self.ways, np.zeros(4, bool), SIGNALS)
         self.state = aspects.none(3, 3)
 
-    def go(self, s: list[float], green: set[int], steps: int = 1, braking: float = 100.0, present: tuple[int, ...] = (0, 1, 2)):
+    def go(
+        self, s: list[float], green: set[int], steps: int = 1, braking: float = 100.0, present: tuple[int, ...] = (0, 1, 2),
+        stands: tuple[int, ...] = (),
+    ):  # fmt: skip
         """So many instants with the trains at these places; the last decision."""
         there = np.isin(np.arange(3), present)
         place = np.array(s)
@@ -31,7 +34,8 @@ class Line:
         for _ in range(steps):
             seen = aspects.sighted(self.ways, self.at, row, place, np.ones(3, bool), np.full(3, FAR))
             shown = np.isin(seen.signal, list(green))
-            self.state, held, told = aspects.decide(self.ways, seen, shown, place, there, np.full(3, braking), self.state)
+            asks, way = ~np.isin(np.arange(3), stands), np.full(3, braking)
+            self.state, held, told = aspects.decide(self.ways, seen, shown, place, there, asks, way, 1.5 * way, self.state)
         return held, told
 
 
@@ -74,6 +78,30 @@ def test_a_green_that_is_taken_back_is_told_where_it_comes_too_late(line):
         assert told == []  # once
 
 
+def test_a_green_is_claimed_that_could_not_be_given_up_by_the_next_step(line):
+    claimed = {}
+    for braking in (150.0, 600.0):
+        line.state = aspects.none(3, 3)
+        line.go([800.0, 500.0, 300.0], {0, 1, 2}, aspects.SETTLES, braking)
+        assert line.state.claims == []  # none is free yet
+        line.go([800.0, 500.0, 300.0], {0, 1, 2}, 1, braking)
+        claimed[braking] = line.state.claims
+    assert claimed == {150.0: [[0, 0]], 600.0: [[0, 0], [0, 2], [2, 1]]}  # train 1 is not the first before its signal
+    line.go([800.0, 500.0, 300.0], {1, 2}, 1, 600.0)
+    assert line.state.claims == [[2, 1]]  # what lies behind a red is out of reach
+    line.go([1100.0, 500.0, 1001.0], {0, 1}, 1, 600.0)
+    assert line.state.claims == []
+
+
+def test_who_stands_at_a_stop_asks_for_nothing_and_its_green_means_nothing(line):
+    held, _ = line.go([800.0, 500.0, 300.0], {0, 2}, 10, stands=(0,))
+    assert held.room[0] == 199.5 and line.state.claims == []
+    held, _ = line.go([800.0, 500.0, 300.0], {0, 2}, aspects.SETTLES - 1)
+    assert held.room[0] == 199.5
+    held, _ = line.go([800.0, 500.0, 300.0], {0, 2})
+    assert np.isinf(held.room[0])
+
+
 def test_a_red_that_is_passed_is_told(line):
     line.go([999.0, 500.0, 300.0], {2}, 5)
     _, told = line.go([1003.0, 500.0, 300.0], {2})
@@ -92,7 +120,7 @@ def test_a_train_that_turned_or_was_led_another_way_has_passed_nothing(line):
         seen = aspects.sighted(new, aspects.table(new, np.zeros(4, bool), SIGNALS), new.first[:-1] + [1, 0, 0],
                                np.array([1003.0, 500.0, 300.0]), np.ones(3, bool), np.full(3, FAR))  # fmt: skip
         told = aspects.decide(new, seen, np.zeros(len(seen.signal), bool), np.array([1003.0, 500.0, 300.0]), np.ones(3, bool),
-                              np.zeros(3), line.state)[2]  # fmt: skip
+                              np.ones(3, bool), np.zeros(3), np.zeros(3), line.state)[2]  # fmt: skip
         assert [one.passed for one in told] == [True] * passes
 
 
@@ -111,3 +139,13 @@ def test_turns_at_joins_are_those_of_the_signals(line):
     assert (found.edge.tolist(), found.train.tolist()) == ([2], [0])
     found = aspects.order(line.ways, joins, row, s, there, FAR, np.full(3, np.inf))
     assert found.train[np.argsort(found.rank)].tolist() == [2, 0, 1]
+
+
+def test_a_train_that_passes_a_join_again_has_its_turn_of_the_first_time():
+    """On a ring: the next time round comes after whoever is to join meanwhile."""
+    way, length = [[0, 2, 0, 2], [1, 2]], np.array([1000.0, 1000.0, 1000.0])
+    rows, joins = ways(way, np.zeros(3), length), np.array([True, False, True])
+    row, s = rows.first[:-1], np.array([900.0, 500.0])
+    found = aspects.order(rows, joins, row, s, np.ones(2, bool), FAR, np.full(2, np.inf))
+    turns = sorted(zip(found.rank.tolist(), found.edge.tolist(), found.train.tolist(), strict=True))
+    assert [(edge, train) for _, edge, train in turns] == [(0, 0), (2, 0), (2, 1)]

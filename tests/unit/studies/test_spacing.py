@@ -166,6 +166,24 @@ def test_a_row_from_the_search_to_the_calm_run(tmp_path) -> None:
     json.dumps(row)
 
 
+def test_the_string_gain_is_the_laws_own(tmp_path) -> None:
+    """A constant time gap damps what the train ahead does, relative braking passes it on; errors on every link would hide both."""
+    gap, relative = (spacing.measured(PLAN, row, 700.0, tmp_path)["string_gain"] for row in ("time_headway", "relative_braking"))
+    assert 0.5 < gap < 1.0 and relative == pytest.approx(1.0, abs=0.01)
+
+
+def test_sumo_says_the_same_of_stops_and_of_contacts(tmp_path, capfd) -> None:
+    told = [stopped(PLAN, "sliding_mode", at, range(3), tmp_path, sumo)[0] for at in (205.0, 500.0) for sumo in (False, True)]
+    assert [(o.what, o.contacts, round(o.gap_m, 6)) for o in told[::2]] == [
+        (o.what, o.contacts, round(o.gap_m, 6)) for o in told[1::2]
+    ]
+    assert told[1].what == UNSAFE and told[3].what == SAFE and capfd.readouterr().err == ""
+    found = spacing.in_sumo(PLAN, "sliding_mode", 500.0, tmp_path)
+    assert [(one["share"], one["first"], one["of"]) for one in found] == [(0.95, 0, 6), (1.0, 0, 6), (1.0, 6, 6)]
+    lines = spacing_shown.sumo_lines([ROW, {**ROW, "in_sumo": found}])
+    assert lines == ["sliding mode in SUMO: failed 0 of 6 at 95 %, 0 of 6 at it; of others 0 of 6 (0 .. 39 %)"]
+
+
 def test_rows_that_are_done_stay(tmp_path) -> None:
     place = tmp_path / "sliding_mode" / spacing.ROW
     place.parent.mkdir()

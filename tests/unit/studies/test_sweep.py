@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from trainctl.errors import InputError, LawError
+from trainctl.errors import InputError, LawError, TrainctlError
 from trainctl.record.folder import held
 from trainctl.studies import sweep as sweeping
 from trainctl.studies.results import shares, wilson
@@ -219,6 +219,18 @@ def test_two_sweeps_do_not_write_into_one_folder(tmp_path):
         with held(out), pytest.raises(InputError, match="another process is writing there"):
             sweep(plan, out, **more)
     assert list(out.iterdir()) == []
+
+
+def test_workers_that_cannot_be_started_are_an_error_in_words(tmp_path, monkeypatch):
+    """As where there is no network at all, not even the loopback."""
+
+    def refuses(**options):
+        assert options["host"] == "127.0.0.1"
+        raise RuntimeError("Cluster failed to start")
+
+    monkeypatch.setattr("distributed.LocalCluster", refuses)
+    with pytest.raises(TrainctlError, match=r"could not be started on 127\.0\.0\.1.*Cluster failed to start"):
+        sweep(SweepPlan("fully_distributed", SHORT, [0], {}, "numeric"), tmp_path / "s")
 
 
 MANY = SweepPlan(

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 
+import nets
 import numpy as np
+import pandas as pd
 import pytest
+import tomli_w
 
 from trainctl.cli.program import main
 from trainctl.errors import InputError, SimulatorError
@@ -113,3 +116,41 @@ def test_from_the_command_line(tmp_path, monkeypatch, capsys):
     assert typed(*watch, "--backend", "numeric") == 2
     assert "--gui: " in capsys.readouterr().err
     assert typed("replay", "r", "--from-s", "-1") == 2
+
+
+@pytest.mark.parametrize(
+    ("law", "length", "until"), [("robust_constrained", 100.0, 330), ("robust_constrained", 700.0, 96), ("sumo", 100.0, 330)]
+)
+def test_trains_that_turn_back_are_shown_again(law, length, until, tmp_path, monkeypatch):
+    """Edge by edge, to and fro; the long one turns on two edges in the last step but one, before it has run over any of them."""
+    stops = "".join(f'<stop lane="{e}_0" endPos="{x}" duration="10"/>' for e, x in (("bc", 400), ("-ab", 900)))
+    types = nets.EMU.replace('length="100"', f'length="{length}"')
+    internal = () if length < 400.0 else ("--no-internal-links",)
+    nets.terminals(tmp_path, nets.train("v", "ab bc -bc -ab ab bc", 0, stops), *internal, scale=0.5, types=types)
+    if law == "sumo":
+        tables = nets.scenario("robust_constrained", until) | {"controller": {"law": "sumo"}}
+        tables = {k: v for k, v in tables.items() if k not in ("plant", "bounds", "topology")}
+        tables["topology"] = {"spacing_m": 1200.0}
+    else:
+        kind = nets.LAWS["robust_constrained"]["train_type"] | {"unit_length_m": length}
+        tables = nets.scenario(law, until, train_type={"emu": kind})
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(tables))
+    done = run(open_scenario(str(tmp_path / "s.toml")), tmp_path / "out")
+    shown = {}
+    move = gui.Gui.move
+
+    def moved(self, *arguments):
+        move(self, *arguments)
+        if "v" in self.api.vehicle.getIDList():
+            shown[self.now()] = (self.api.vehicle.getRoadID("v"), self.api.vehicle.getLanePosition("v"))
+
+    monkeypatch.setattr(gui.Gui, "move", moved)
+    assert replay(done, "sumo", delay_ms=0.0) > 0.9 * until
+    log = pd.read_parquet(done.folder / "sumo" / "fcd.parquet").set_index("timestep_time")
+    assert len(shown) >= len(log) - 2
+    near = 1.0 if law == "sumo" else 0.05  # SUMO's own train still moves in the step in which it turns
+    for t, (edge, place) in shown.items():
+        row = log.loc[t]
+        assert row.vehicle_lane.rpartition("_")[0] == edge or place < near, t
+        assert abs(row.vehicle_pos - place) < near or row.vehicle_lane.rpartition("_")[0] != edge, t
+    assert {edge for edge, _ in shown.values()} >= ({"-ab", "ab", "bc", "-bc"} if length < 400.0 else {"bc", "-ab"})

@@ -308,7 +308,7 @@ def test_what_is_not_followed_is_told(files: Files) -> None:
         "option step-length = 0.5: not followed: the step is run.step_s of the scenario",
         "1 x <vehicle arrivalSpeed>: not followed: trains leave as fast as they come",
         "1 x <vehicle speedFactor>: not followed: that of the vType holds",
-        "1 x <stop triggered>: not followed: nobody boards; a train stands as long as duration and until say",
+        "1 x <stop triggered>: not followed: no passengers board; a train stands as long as duration and until say",
         "1 x <calibrator>: not followed: no train is let in or taken out by it",
     )
 
