@@ -203,9 +203,9 @@ class Traffic:
 
     def kept_parked(self, trains: Sequence[int], s: State) -> State:
         """Trains that SUMO has not let back from where they are parked: they are to ask again."""
-        s = s._replace(parked=s.parked.copy())
-        s.parked[trains] = True
-        return s
+        parked = s.parked.copy()
+        parked[trains] = True
+        return s._replace(parked=parked)
 
     def due(self, t: float, s: State) -> list[int]:
         """Trains that are to come at ``t``: of each edge the first that waits there."""
@@ -459,9 +459,8 @@ class Traffic:
         return braking + 4.0 * v * self.step_s + rules.margin_m + 2.0 * DRIVER_MARGIN_M + 50.0 + 6.0 * assumed.uncertainty
 
     def _ordered(self, t: float, ways: Ways, seen: Seen, s: State) -> list[tuple[int, int, int]]:
-        """Trains that must let another one pass an edge first: train, row of the edge in its way, the other one."""
-        never = s.left | ~s.came & self._given_up(t) if self.pairs else s.left
-        return zones.passes_first(self.pairs, self.net, ways, seen.row, s.came, never)
+        """Trains that must let another one pass an edge first, see ``zones.passes_first``."""
+        return zones.passes_first(self.pairs, self.net, ways, seen.row, s.came, s.left | ~s.came & self._given_up(t))
 
     def _request(
         self, t: float, ways: Ways, seen: Seen, reach: Floats, entering: Bools, keeps: Bools, s: State
