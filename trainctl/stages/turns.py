@@ -71,7 +71,8 @@ class Turns:
         for i in np.flatnonzero(leg < self.last_leg).tolist():
             rows, onward = slice(int(ways.first[i]), int(ways.first[i + 1])), self.legs[i][int(leg[i]) + 1]
             found = turning.yard(
-                ways.edge[rows], ways.begin[rows], onward, rails.twin, rails.internal, rails.length_m, float(self.length[i])
+                ways.edge[rows], ways.begin[rows], onward, rails.twin, rails.internal, rails.length_m, float(self.length[i]),
+                rails.before,
             )  # fmt: skip
             if len(found.places):
                 self.yards[i] = found
