@@ -43,6 +43,7 @@ PAGES = (
     "trainctl/claims/README.md",
     "trainctl/controllers/README.md",
     "trainctl/diff/README.md",
+    "trainctl/environment/README.md",
     "trainctl/runs/README.md",
     "trainctl/studies/README.md",
 )
