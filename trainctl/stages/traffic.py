@@ -75,14 +75,14 @@ class Around(NamedTuple):
     entries: tuple[tuple[int, float], ...]  # trains that come with the coming step, with their speeds [m/s]
     stops: tuple[Ints, Floats]  # trains with a stop ahead, and the room to it [m]
     soon: Bools  # (n,) they stop soon
-    held: Held | None  # how far each may go before a place that is another's; None: nobody asks
+    held: Held | None  # how far each may go before a place that another has; None: not needed
     kept_out: dict[int, int]  # trains that are due and cannot enter: because of whom
-    view: View | None  # None: nobody asks
+    view: View | None  # None: not needed
     turns: tuple[Turn, ...] = ()  # trains that turn with the coming step
 
 
 def nothing(trains: int) -> Around:
-    """Nobody comes, stops, waits or looks ahead."""
+    """No train comes, stops, waits or looks ahead."""
     return Around((), (np.zeros(0, np.int64), np.zeros(0)), np.zeros(trains, bool), None, {}, None)
 
 
@@ -134,7 +134,7 @@ class Traffic:
         """Arrivals, stops, entries; ``overrun`` (n,) is how much farther trains run than their brakes promise [m].
 
         Who is due at the end of the coming step is let in now, and is there then: in time. ``speed`` (n,) gets the speeds of trains
-        that enter; at the ``last`` instant of a run nobody does. ``red`` is how far signals let everybody go, where they decide.
+        that enter; at the ``last`` instant of a run none does. ``red`` is how far signals let each train go, where they decide.
         """
         s = self.departures(t, seen, speed, self.arrivals(t, seen, s))
         if not self.looks:
@@ -351,7 +351,7 @@ class Traffic:
         return min(stop.place, last) - (stop.waits_before if self._full(stop, s) else 0.0)
 
     def _further(self, stop: Stop, i: int) -> float:
-        """How far behind a stop a train would come to a stand that passes it as fast as it may [m]; 0 if it is to stand there."""
+        """How far beyond a stop a train comes to a standstill that passes it as fast as it may [m]; 0 if it is to stop there."""
         return float(self.stopping(np.array([i]), np.array([stop.passing]))[0]) if stop.passing else 0.0
 
     def _stops(self, t: float, seen: Seen, speed: Floats, overrun: Floats, s: State) -> tuple[State, tuple[Ints, Floats], Bools]:
