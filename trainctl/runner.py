@@ -23,6 +23,7 @@ from sumo_net import LineError
 from sumo_net.netfile import unpack
 from trainctl.compiling import compiling
 from trainctl.errors import InputError, SimulatorError, left_out
+from trainctl.in_service import loop_of
 from trainctl.loop import Loop
 from trainctl.metrics.run import metrics
 from trainctl.metrics.versions import VERSION
@@ -251,7 +252,7 @@ def _driven(
                 if every_s is not None:
                     world = tape = checkpoint.Tape(world, place, saved)
                 journal.silent = saved is not None  # what a run told when it began is written already
-                simulation = Loop(p, world, journal)
+                simulation = loop_of(p, world, journal)
                 if saved is not None and tape is not None:
                     checkpoint.restore(simulation, tape, saved)
                 journal.silent = False

@@ -1,6 +1,6 @@
 """Stacked runs from their start to their end: the stages of ``loop``, those left out that have nothing to do.
 
-Nobody comes, stops, waits, is driven or protected in runs that can be stacked (``stack.alone``), and the links stay as they are.
+No train comes, stops, waits, is driven or protected in runs that can be stacked (``stack.alone``), and the links stay as they are.
 """
 
 from __future__ import annotations
