@@ -45,6 +45,7 @@ class State(NamedTuple):
     demand: Demand  # held over the control period
     memory: Any  # of a sampled law that keeps a state of its own, else ()
     commanded: Floats  # (n,) m/s2, accelerations set from outside, NaN where none
+    added: Floats  # (n,) m/s2, added from outside to what a sampled law asks for
     plant: plant.State
     watch: record.State
 
@@ -60,15 +61,18 @@ class Loop(Steps):
         SUMO, or the numeric stand-in.
     journal : Journal
         Where rows and events go.
+    goes_on : bool
+        Whether the trains are on the railway already.
     """
 
     state: State
 
-    def __init__(self, model: Model, world: World, journal: record.Journal) -> None:
+    def __init__(self, model: Model, world: World, journal: record.Journal, goes_on: bool = False) -> None:
         super().__init__(model, journal)
         self.world, self.built = world, model
         p, run = model, model.scenario.run
         self.ours = ~p.roster.driven
+        self.train = np.repeat(np.arange(len(p.leading)), np.diff(p.consists.first))  # (U,) of every unit
         self.disturbances = disturbance.signals(p.scenario.disturbance, p.scenario.ids, run.step_s, run.seed, p.worst)
         self.rerouters = rerouters.Rerouters(p, journal)
         self.orders, self.traffic = orders.Orders(p, journal), traffic.Traffic(p, journal)
@@ -81,16 +85,18 @@ class Loop(Steps):
             k=0, own=p.own.copy(), orders=self.orders.initial(), rerouters=self.rerouters.initial(),
             signals=self.signals.initial(), traffic=self.traffic.initial(), rule=rule, formed=formed,
             messages=exchange.silent(), demand=self.control.initial(), memory=(),
-            commanded=np.full(len(p.scenario.ids), np.nan), plant=self.plant.initial(), watch=self.record.initial(),
+            commanded=np.full(len(p.scenario.ids), np.nan), added=np.zeros(len(p.scenario.ids)),
+            plant=self.plant.initial(), watch=self.record.initial(),
         )  # fmt: skip
-        self._start()
+        if not goes_on:
+            self._start()
 
     def after(self, s: State) -> State:
         """The state a step later."""
         p, world, t, leading = self.p, self.world, self.time, self.p.leading
 
         # measure: SUMO -> where every train is on its way; its units follow, as a whole
-        own = self._measured(s)
+        own = self.measured(s)
 
         # orders: new routes first, since they change the rows of all trains
         def stops_in() -> Floats:
@@ -137,7 +143,8 @@ class Loop(Steps):
         # control: -> what the law asks for; what a driver, or a command from outside, orders instead (NaN: the law leads)
         acting = disturbance.at(self.disturbances, s.k, t, seen.position)
         demand, formed, messages, memory = self.control.step(
-            s.k, t, own, self.plant.believed_resistance, formed, messages, s.demand, s.memory, s.commanded, acting
+            s.k, t, own, self.plant.believed_resistance, formed, messages, s.demand, s.memory, s.commanded, s.added,
+            acting,
         )  # fmt: skip
         self._climb(own, formed, ways, here)
         speed, acceleration = own[leading, SPEED], self.plant.acceleration(own)
@@ -170,20 +177,20 @@ class Loop(Steps):
         for turn in around.turns:
             world.turn(*turn)
         world.move(moved.motion.displacement, p.scenario.run.step_s)
-        if world.box is not None:  # who is not let back from where it is parked is to ask again
-            going.parked[world.box.kept_parked()] = True
+        if world.box is not None and (kept := world.box.kept_parked()):  # they are to ask again
+            going = going._replace(parked=going.parked | np.isin(np.arange(len(going.parked)), kept))
         formed = self.topology.rule.after(formed)
         if around.turns:
             moved, formed = self._turned(t, [turn.train for turn in around.turns], moved, formed, going, watch)
         return State(
             s.k + 1, moved.own, ordered, stuck, shown, going, rule, formed, moved.messages, demand, memory, s.commanded,
-            moved.state, watch,
+            s.added, moved.state, watch,
         )  # fmt: skip
 
     def end(self) -> None:
         """The last instant, from which no train moves on: no orders, no entries; else sorted, watched and recorded as any other."""
         s, world, t = self.state, self.world, self.time
-        own, here, ways = self._measured(s), world.measure(), world.ways
+        own, here, ways = self.measured(s), world.measure(), world.ways
         late = self.plant.overrun(own, self.p.driver_rules.service_mps2)
         speed = own[self.p.leading, SPEED].copy()
         _, red = self.signals.step(t, ways, here, speed, s.traffic, world.box, s.signals)
@@ -208,6 +215,10 @@ class Loop(Steps):
         commanded = self.state.commanded.copy()
         commanded[trains] = acceleration
         self.state = self.state._replace(commanded=commanded)
+
+    def add(self, acceleration: Floats) -> None:
+        """Add accelerations (n,) [m/s2] to what the law asks for, from the next control instant on."""
+        self.state = self.state._replace(added=acceleration.copy())
 
     def order(self, event: Event) -> None:
         """Give an order from outside."""
@@ -241,14 +252,13 @@ class Loop(Steps):
             self.state = s._replace(traffic=going)
         self.world.start(start)
 
-    def _measured(self, s: State) -> Floats:
+    def measured(self, s: State) -> Floats:
         """SUMO owns where a train is: shift every train, as a whole, onto its measured front."""
         own = s.own.copy()
         shift = self.world.measure().position + s.formed.offset - own[self.p.leading, POSITION]
-        units = np.diff(self.p.consists.first)
-        own[:, POSITION] += np.repeat(shift, units)
+        own[:, POSITION] += shift[self.train]
         if (box := self.world.box) is not None:  # trains that SUMO drives run as a whole
-            speeds = np.repeat(box.speeds(), units)
+            speeds = box.speeds()[self.train]
             own[:, SPEED] = np.where(np.isnan(speeds), own[:, SPEED], speeds)
         return own
 

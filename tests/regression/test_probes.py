@@ -1,5 +1,7 @@
 """One probe for each attribute of SUMO's files, beside plain SUMO: order, stops and places are equal, times as the driver explains.
 
+The baseline, which is the user's own simulation, runs them too: there times are equal.
+
 All probes run at once, each on a line of its own. The vTypes accelerate and brake as our driver does and run no faster than he
 cruises, so that little is left to explain: a second or two where a train starts, and at every stop that he comes up to it slowly.
 """
@@ -16,6 +18,7 @@ from beside import plain
 
 from trainctl.runner import run
 from trainctl.runs.logs import vehicles
+from trainctl.runs.run import Run
 from trainctl.runs.sumo_logs import elements
 from trainctl.scenario.build import open_scenario
 
@@ -131,9 +134,23 @@ class Seen(NamedTuple):
     named: list[str]
 
 
+def of_run(found: Run) -> Seen:
+    """What was seen in a run."""
+    stops: dict[str, list[tuple[str, float]]] = {}
+    rows = pd.concat(batch.to_pandas() for batch in vehicles(found.folder / "sumo" / "fcd.parquet"))
+    seen = rows.astype({"id": str, "lane": str}).set_index(["id", "time"])
+    for e in found.events:
+        if e["kind"] == "stop_reached":
+            row = seen.loc[(e["train"], e["time_s"])]
+            stops.setdefault(e["train"], []).append((row.lane.rpartition("_")[0], float(row.pos)))
+    trips = {at["id"]: at for _, at in elements(found.folder / "sumo" / "tripinfo.xml", "tripinfos", {"tripinfo"})}
+    times = [{e["train"]: e["time_s"] for e in found.events if e["kind"] == kind} for kind in ("depart", "arrive")]
+    return Seen(*times, trips, stops, [e["what"] for e in found.events if e["kind"] == "not_followed"])
+
+
 @pytest.fixture(scope="module")
-def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Seen, Seen]:
-    """Ours and plain SUMO's."""
+def seen(tmp_path_factory: pytest.TempPathFactory) -> tuple[Seen, Seen, Seen]:
+    """Ours, plain SUMO's and the baseline's."""
     folder = tmp_path_factory.mktemp("probes")
     nodes, edges, body, more = {}, {}, "", ""
     for k, (name, probe) in enumerate(PROBES.items()):
@@ -155,17 +172,11 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Seen, Seen]:
     tables["reference"] = {"speed_mps": 30.0}
     (folder / "s.toml").write_text(tomli_w.dumps(tables))
     p = open_scenario(str(folder / "s.toml"))
-    found = run(p, folder / "out")
-    stops: dict[str, list[tuple[str, float]]] = {}
-    rows = pd.concat(batch.to_pandas() for batch in vehicles(found.folder / "sumo" / "fcd.parquet"))
-    seen = rows.astype({"id": str, "lane": str}).set_index(["id", "time"])
-    for e in found.events:
-        if e["kind"] == "stop_reached":
-            row = seen.loc[(e["train"], e["time_s"])]
-            stops.setdefault(e["train"], []).append((row.lane.rpartition("_")[0], float(row.pos)))
-    trips = {at["id"]: at for _, at in elements(found.folder / "sumo" / "tripinfo.xml", "tripinfos", {"tripinfo"})}
-    times = [{e["train"]: e["time_s"] for e in found.events if e["kind"] == kind} for kind in ("depart", "arrive")]
-    ours = Seen(*times, trips, stops, [e["what"] for e in found.events if e["kind"] == "not_followed"])
+    ours = of_run(run(p, folder / "out"))
+    own = {key: tables[key] for key in ("schema_version", "title", "run", "network", "reference", "train_type")}
+    own |= {"controller": {"law": "sumo", "block": "moving"}, "topology": {"spacing_m": 1200.0}}
+    (folder / "own.toml").write_text(tomli_w.dumps(own))
+    baseline = of_run(run(open_scenario(str(folder / "own.toml")), folder / "own"))
     options = ("--railsignal-moving-block", "--tripinfo-output", "trips.xml", "--end", "900")
     halts: dict[str, list[tuple[str, float]]] = {}
     for row in plain(folder, "stop", *options):
@@ -173,7 +184,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Seen, Seen]:
             halts.setdefault(row["id"], []).append((row["lane"].rpartition("_")[0], float(row["pos"])))
     trips = {at["id"]: at for _, at in elements(folder / "trips.xml", "tripinfos", {"tripinfo"})}
     times = [{name: float(at[key]) for name, at in trips.items()} for key in ("depart", "arrival")]
-    return ours, Seen(*times, trips, halts, [])
+    return ours, Seen(*times, trips, halts, []), baseline
 
 
 def of_line(names: object, name: str) -> list[str]:
@@ -181,11 +192,11 @@ def of_line(names: object, name: str) -> list[str]:
 
 
 @pytest.mark.parametrize("name", PROBES)
-def test_a_probe_does_what_it_does_in_plain_sumo(both, name):
-    ours, theirs = both
+def test_a_probe_does_what_it_does_in_plain_sumo(seen, name):
+    ours, theirs, _ = seen
     trains = of_line(theirs.trips, name)
     assert sorted(of_line(ours.trips, name)) == sorted(trains) and trains
-    orders = [sorted(trains, key=lambda train: seen.arrivals[train]) for seen in both]
+    orders = [sorted(trains, key=lambda train: one.arrivals[train]) for one in (ours, theirs)]
     assert orders[0] == orders[1]
     for train in trains:
         here, there = ours.trips[train], theirs.trips[train]
@@ -198,8 +209,23 @@ def test_a_probe_does_what_it_does_in_plain_sumo(both, name):
         assert [x for _, x in stops] == pytest.approx([x for _, x in halts], abs=0.5)
         late = ours.arrivals[train] - theirs.arrivals[train]
         said = PROBES[name].named
-        print(name, train, late)
         if said:
             assert [line for line in ours.named if said in line]
         else:
             assert abs(late) <= START_S + STOP_S * len(halts), late
+
+
+@pytest.mark.parametrize("name", PROBES)
+def test_a_probe_does_the_same_in_the_baseline_to_the_second(seen, name):
+    _, theirs, own = seen
+    trains = of_line(theirs.trips, name)
+    assert sorted(of_line(own.trips, name)) == sorted(trains) and trains
+    for train in trains:
+        here, there = own.trips[train], theirs.trips[train]
+        for key in ("departPos", "arrivalPos"):
+            assert float(here[key]) == pytest.approx(float(there[key]), abs=0.01), key
+        assert here["arrivalLane"] == there["arrivalLane"] and here["departLane"] == there["departLane"]
+        assert own.departs[train] == theirs.departs[train] and abs(own.arrivals[train] - theirs.arrivals[train]) <= 1.0
+        stops, halts = own.stops.get(train, []), theirs.stops.get(train, [])
+        assert [edge for edge, _ in stops] == [edge for edge, _ in halts]
+        assert [x for _, x in stops] == pytest.approx([x for _, x in halts], abs=0.5)

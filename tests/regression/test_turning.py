@@ -332,6 +332,26 @@ def test_no_law_causes_a_collision_where_trains_turn(style, tmp_path):
     assert not told(found, "gridlock") and not [e for e in told(found, "violation") if e["bound"] in (GAP, LIMIT)]
 
 
+@pytest.mark.parametrize("branch", [False, True])
+def test_a_train_turns_where_it_begins_though_it_hangs_out_behind(branch, tmp_path):
+    """As in SUMO; beyond a switch nobody knows where its rear is."""
+    nodes = {name: (x, 0) for name, x in zip("abcde", (0, 600, 1100, 1150, 1200), strict=True)} | {"x": (900, 300)}
+    edges = {key: value for one, two in ("ab", "bc", "cd", "de") for key, value in nets.both_ways(one + two, one, two).items()}
+    nets.net(tmp_path, nodes, edges | (nets.both_ways("xd", "x", "d") if branch else {}), nets.TERMINALS, "--no-internal-links")
+    types = nets.EMU.replace('length="100"', 'length="130"')
+    nets.traffic(tmp_path, nets.train("v", "de -de -cd -bc -ab", 0, departSpeed=0), types)
+    kind = nets.LAWS["robust_constrained"]["train_type"] | {"unit_length_m": 130.0}
+    if branch:
+        with pytest.raises(InputError, match="cannot turn back from edge de to edge -de: its 130 m do not fit on the track"):
+            opened_in(tmp_path, "robust_constrained", 300, train_type={"emu": kind})
+        return
+    found = both(opened_in(tmp_path, "robust_constrained", 300, train_type={"emu": kind}), tmp_path)
+    [turned], [_] = told(found, "turn"), told(found, "arrive")
+    assert (turned["time_s"], turned["from_edge"]) == (1.0, "de") and len(plain(tmp_path, "tripinfo")) == 1
+    rows = found.trains.set_index("time_s")
+    assert str(rows.edge[0.0]) == "de" and str(rows.edge[2.0]) == "-bc"
+
+
 def test_turns_that_cannot_be_are_refused_with_the_edges(tmp_path):
     nets.terminals(tmp_path, nets.train("v", "ab -ab", 0) + nets.train("w", "ab bc -bc", 10), scale=0.25)
     with pytest.raises(InputError) as refused:

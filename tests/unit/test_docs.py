@@ -43,6 +43,7 @@ PAGES = (
     "trainctl/claims/README.md",
     "trainctl/controllers/README.md",
     "trainctl/diff/README.md",
+    "trainctl/environment/README.md",
     "trainctl/runs/README.md",
     "trainctl/studies/README.md",
 )
@@ -94,6 +95,18 @@ REPLACED: dict[str, tuple[str | None, str]] = {
     "srun dask worker --scheduler-file s.json --nthreads 1 --nworkers 1 &": (None, "the same"),
     "trainctl sweep monte_carlo --scheduler s.json": (None, "the same"),
 }  # fmt: skip
+
+#: Replaced since they take long: by hand they run as they are printed (pytest -m campaign).
+LONG = (
+    "trainctl run three_tracks", "trainctl run fully_distributed --backend numeric", "trainctl run robust_three_tracks",
+    "trainctl run three_tracks --set controller.eta=printed --set run.duration_s=600 --out runs/printed",
+    "trainctl run three_tracks --set controller.law=sumo --set controller.block=moving --out runs/moving",
+    "trainctl run three_tracks --set controller.law=sumo --set controller.signals_m=4000 --out runs/fixed",
+    "trainctl run fault_tolerant_noise --backend numeric",
+    "trainctl compare capacity", "trainctl compare spacing", "trainctl compare suite",
+    "trainctl sweep fully_distributed --set topology.loss=0,0.1,0.2 --seeds 0..99", "trainctl sweep monte_carlo",
+    "trainctl tune robust_constrained --gain h_per_s=0.05..1 --objective settling=1,jerk=100 --set topology.loss=0.3 --seeds 0..19",
+)  # fmt: skip
 
 #: Commands that read files of other projects, which are not here; their own tests run them on small files of the same form.
 FOREIGN = ("trainctl net import ",)
@@ -192,7 +205,14 @@ def test_every_block_of_the_page_runs(page, tmp_path, monkeypatch, capfd):
 
 def test_replacements_are_of_lines_that_exist():
     there = {line for page in PAGES for language, text in blocks(page) if language == "sh" for line in lines(text)}
-    assert set(REPLACED) <= there
+    assert set(REPLACED) <= there and set(LONG) <= set(REPLACED)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("line", LONG)
+def test_a_command_that_takes_long_runs_as_it_is_printed(line, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    assert typed(line, monkeypatch) == 0, capfd.readouterr().err
 
 
 def inline(page: str) -> list[str]:
@@ -219,6 +239,11 @@ def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#]+)\)", (ROOT / page).read_text()):
         if not target.startswith("http"):
             assert ((ROOT / page).parent / target).exists(), f"{page}: {target}"
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_no_page_has_what_a_merge_left(page):
+    assert not re.search(r"^(<{7}|={7}|>{7})", (ROOT / page).read_text(), re.M)
 
 
 def test_the_readme_fits_two_screens():

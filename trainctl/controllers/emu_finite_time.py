@@ -61,13 +61,14 @@ COMPARED: dict[str, dict[str, Any]] = {"emu_finite_time": {"alpha_1": 0.9}, "ord
 
 #: What a train is told in `trainctl compare spacing`, and why its spacing is what it is there.
 IN_STOPS = (
-    "heads and tails of neighbours. The reference pulls on at its speed; only a barrier brakes, from 90 % of the clear distance "
-    "on to half of it"
+    "first and last units of neighbours. The reference runs on at its speed; only a barrier brakes, from 90 % of the clear "
+    "distance on to half of it"
 )
 
 #: Columns of a message: head and tail relative to the leader (the tail moved forward by the units ahead of it), train length.
 HEAD, HEAD_SPEED, TAIL, TAIL_SPEED, LENGTH_OF_TRAIN = range(5)
 MESSAGE = 5
+WORK: tuple[str, ...] = ("terms",)
 
 #: Columns of ``Constants.units``.
 MASS, INERTIA, C0, C1, C2, LENGTH, K_HAT, PAIR, MEAN = range(9)

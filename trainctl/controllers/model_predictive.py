@@ -24,9 +24,11 @@ applied, and the next period plans anew: [1]_ with linear dynamics (running resi
 that the problem is a quadratic programme. DAQP [2]_ solves it by an active set: exactly, not up to a tolerance of the
 constraints. It starts from the constraints that were active in the plan before.
 
-What is not feasible -------------------- Where no plan keeps all constraints (a train ahead that breaks its plan, a message that
-came too late), the train brakes fully, and the column ``saturated`` is set, in that period alone. A speed outside of its bounds
-widens them to what it is.
+What is not feasible
+--------------------
+Where no plan keeps all constraints (a train ahead that breaks its plan, a message that came too late), the train brakes fully, and
+the column ``saturated`` tells so, in that period alone. A speed above its bound widens it to what it is, and must come back by
+``RETURN_MPS2`` at least. Of the room between the reference and the maximum speed a part is left for what disturbs, as in ``ahead``.
 
 Departures
 ----------
@@ -81,6 +83,9 @@ ACTIVE_UPPER, ACTIVE_LOWER = 1, 3
 
 #: A train that accelerates otherwise than it planned by more than this says so [m/s2].
 OFF_PLAN_MPS2 = 0.05
+
+#: A train above its speed bound comes back to it by at least this [m/s2]; more than unknown forces push it on.
+RETURN_MPS2 = 0.1
 
 #: No speed is below 0, and none is bounded above where the scenario says nothing [m/s].
 UNBOUNDED_MPS = 1e3
@@ -199,7 +204,9 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
     c, n, N = constants, len(own.speed), constants.params.horizon
     other = ahead.seen(c.who, own, leader, links, heard[:, : ahead.SAID + 1])
     planned = heard[c.who.row, ahead.SAID + 1 :] if len(heard) else np.zeros((n, N))
-    reference = np.broadcast_to(leader[2], n)
+    cruise, reference = (np.broadcast_to(leader[k], n) for k in (SPEED, 2))
+    fastest = np.minimum(c.bounds.speed_upper, UNBOUNDED_MPS)
+    top = np.where(c.who.follows, np.minimum(fastest, cruise + ahead.ROOM_TO_CLOSE_UP * np.maximum(fastest - cruise, 0.0)), fastest)
     plan, active, infeasible = np.zeros((n, N)), np.zeros((n, 4 * N), np.int64), np.zeros(n, bool)
     before = np.where(_off(own, state, c.T), (own.speed - state.speed) / c.T, state.plan[:, 0])
     for i in range(n):
@@ -208,7 +215,7 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
             continue
         a_l = planned[i] if other.known[i] else np.full(N, reference[i])
         spacing = other.spacing[i] if other.known[i] else c.d[i]
-        solved = _solved(c, i, own, other, spacing, a_l, float(before[i]), state.active[i])
+        solved = _solved(c, i, own, other, spacing, float(top[i]), a_l, float(before[i]), state.active[i])
         if solved is None:
             infeasible[i] = True
             plan[i] = -min(max(c.b[i], c.params.deceleration_mps2), own.speed[i] / c.T)
@@ -224,11 +231,12 @@ def _off(own: Trains, state: State, T: float) -> Bools:
 
 
 def _solved(
-    c: Constants, i: int, own: Trains, other: ahead.Seen, spacing: float, a_l: Floats, before: float, active: Ints
+    c: Constants, i: int, own: Trains, other: ahead.Seen, spacing: float, top: float, a_l: Floats, before: float, active: Ints
 ) -> tuple[Floats, Ints] | None:
     """The plan of train ``i`` (N,) and its active constraints (4 N,); None if there is none.
 
-    ``spacing`` [m] is that to the train ahead now, ``a_l`` (N,) what that one plans, ``before`` the acceleration a period ago.
+    ``spacing`` [m] is that to the train ahead now, ``top`` the maximum speed [m/s], ``a_l`` (N,) what the one ahead plans,
+    ``before`` the acceleration a period ago.
     """
     p, N, T, v = c.params, c.params.horizon, c.T, float(own.speed[i])
     v_l = np.maximum(other.speed[i] + c.L @ a_l, 0.0)
@@ -244,7 +252,8 @@ def _solved(
         upper[0] = min(upper[0], (_safe(c, i, v, spacing, other) - v) / T)
         upper[2 * N : 3 * N] = room - c.who.length[i] - p.margin_m
     lower[N : 2 * N] = min(max(c.bounds.speed_lower[i], 0.0), v) - v
-    upper[N : 2 * N] = max(min(c.bounds.speed_upper[i], UNBOUNDED_MPS), v) - v
+    first = min(max(before - p.jerk_mps3 * T, -RETURN_MPS2), 0.0)  # from where it is the jerk may forbid more in one period
+    upper[N : 2 * N] = np.maximum(top - v, T * (first - RETURN_MPS2 * np.arange(N)))
     lower[3 * N :], upper[3 * N :] = -p.jerk_mps3 * T, p.jerk_mps3 * T
     lower[3 * N] += before
     upper[3 * N] += before

@@ -62,7 +62,7 @@ COMPARED: dict[str, dict[str, Any]] = {"robust_constrained": {"h_per_s": 0.3}}
 
 #: What a train is told in `trainctl compare spacing`, and why its spacing is what it is there.
 IN_STOPS = (
-    "neighbours say where they are. The reference pulls on at its speed; all trains behind push, and only metres "
+    "neighbours say where they are. The reference runs on at its speed; all trains behind push, and only metres "
     "times weight hold them"
 )
 

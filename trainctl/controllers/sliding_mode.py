@@ -35,13 +35,9 @@ Departures
 ----------
 * [1]_ has a sign function in a boundary layer as well, but no observer; the constant spacing it keeps with the first train's
   speed is string stable, and without that it is only as far as a_l comes in time: with a control period of T errors may grow by
-<<<<<<< HEAD
-  about a_l's delay. ``trainctl compare spacing`` tells by how much.
+  about a_l's delay. ``trainctl compare spacing`` shows by how much.
 * z2 stays within -w .. w. An actuator at a limit the law does not know of, such as the power at high speed, is to the observer a
   force that brakes: without a bound it takes up whatever was asked for in vain, and pushes on for some 1 / omega after the end.
-=======
-  about a_l's delay. ``trainctl compare spacing`` shows by how much.
->>>>>>> main
 * a_l is the mean acceleration of the control period before, as the train ahead measures it.
 * Old messages are carried forward, see ``ahead``. A train that follows none takes the speed of the reference.
 

@@ -1,12 +1,12 @@
 """Stacked runs from their start to their end: the stages of ``loop``, those left out that have nothing to do.
 
-Nobody comes, stops, waits, is driven or protected in runs that can be stacked (``stack.alone``), and the links stay as they are.
+No train comes, stops, waits, is driven or protected in runs that can be stacked (``stack.alone``), and the links stay as they are.
 """
 
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -23,7 +23,21 @@ from trainctl.plants import disturbance
 from trainctl.railway.ways import Ways
 from trainctl.runs.series import INSTANT
 from trainctl.scenario.model import Model
-from trainctl.signals import POSITION, SPEED, Floats, Ints, Row, Seen, leader_over
+from trainctl.signals import (
+    POSITION,
+    SPEED,
+    Bools,
+    Demand,
+    Disturbed,
+    Floats,
+    Formed,
+    Ints,
+    Messages,
+    Motion,
+    Row,
+    Seen,
+    leader_over,
+)  # fmt: skip
 from trainctl.stages import plant
 from trainctl.stages.control import Control
 from trainctl.topology import exchange
@@ -39,78 +53,138 @@ class Done(NamedTuple):
     why_alone: tuple[str | None, ...]  # why a run must be done by itself; its numbers mean nothing
 
 
+class State(NamedTuple):
+    """All that changes from step to step, as in ``loop.State``."""
+
+    k: int  # steps done
+    own: Floats  # (U, s) of all trains' units, at the measured positions
+    row: Ints  # (N,) of every train in its ways
+    lane_position: Floats  # (N,) m, on the edge of that row
+    position: Floats  # (N,) m, along the way
+    formed: Formed
+    messages: Messages
+    demand: Demand
+    memory: Any
+    plant: plant.State
+
+
+class Stepped(NamedTuple):
+    """What a step makes of the runs, and how."""
+
+    state: State
+    motion: Motion
+    acting: Disturbed
+    saturated: Bools  # (N,) of the law or by the plant's limits
+
+
+class Abreast:
+    """The stages of stacked runs, made once from the stack."""
+
+    def __init__(self, stack: Stack) -> None:
+        self.stack, self.p = stack, stack.model
+        self.control, self.plant = Control(self.p, stack.radio, strict=False), plant.of(self.p, stack.radio)
+        self.free, self.nothing = np.full(len(stack.row), np.nan), np.zeros(len(stack.row))
+
+    def initial(self) -> State:
+        """All runs at their start."""
+        p, stack = self.p, self.stack
+        own, row, lane_position = p.own.copy(), stack.row.copy(), stack.lane_position.copy()
+        position = _measured(stack.ways, row, lane_position, p.consists.first, own)
+        scene = p.scene(own, stack.links, 0.0)
+        constants = p.law.constants(p.params, scene)
+        units = self.plant.relinked(scene, constants, self.plant.initial())
+        return State(
+            0, own, row, lane_position, position, stack.formed._replace(constants=constants), exchange.silent(),
+            self.control.initial(), (), units,
+        )  # fmt: skip
+
+    def after(self, s: State, commanded: Floats | None = None, added: Floats | None = None) -> Stepped:
+        """A step later; ``commanded`` and ``added`` (N,) [m/s2] are as in ``loop.State``."""
+        p, stack, t = self.p, self.stack, s.k * self.p.scenario.run.step_s
+        acting = disturbance.at(stack.signals, s.k, t, s.position)
+        demand, formed, messages, memory = self.control.step(
+            s.k, t, s.own, self.plant.believed_resistance, s.formed, s.messages, s.demand, s.memory,
+            self.free if commanded is None else commanded, self.nothing if added is None else added, acting,
+        )  # fmt: skip
+        moved = self.plant.step(s.k, t, s.own, demand, self.free, formed, messages, s.plant, acting)
+        row, lane_position, own = s.row.copy(), s.lane_position.copy(), moved.own
+        numeric.go_on(stack.ways, p.line.length_m, moved.motion.displacement, row, lane_position)
+        position = _measured(stack.ways, row, lane_position, p.consists.first, own)
+        state = State(
+            s.k + 1, own, row, lane_position, position, formed, moved.messages, demand, memory, moved.state
+        )  # fmt: skip
+        return Stepped(state, moved.motion, acting, demand.saturated | moved.motion.limited)
+
+    def left(self, s: State) -> Bools:
+        """Trains (N,) that have left the line."""
+        ends = self.stack.ways.first[1:] - 1
+        gone: Bools = (s.row == ends) & (s.lane_position > self.p.line.length_m[self.stack.ways.edge[ends]] - LEAVES_M)
+        return gone
+
+
 def simulated(stack: Stack) -> Done:
     """Drive all runs of a stack to their end."""
-    p = stack.model
-    run, control, moving = p.scenario.run, Control(p, stack.radio), plant.of(p, stack.radio)
+    abreast, p = Abreast(stack), stack.model
+    run = p.scenario.run
     fixed, chained = measures.fixed(stack)
     counts = count.nothing(fixed, len(stack.runs))
     due = [k for k in range(run.steps + 1) if k % run.recorded_steps == 0 or k == run.steps]
     instants = dict(zip(due, _instants(p, np.array(due) * run.step_s), strict=True))
     recorded = Recorded(np.array(due) * run.step_s, np.empty((len(due), len(p.leading))))
-    own, row, lane_position = p.own.copy(), stack.row.copy(), stack.lane_position.copy()
-    state, messages, demand, memory = moving.initial(), exchange.silent(), control.initial(), ()
-    nobody, there = np.full(len(row), np.nan), np.ones(len(row), bool)
-    track, length = on_track.track(p.rails, p.line.tracks), p.consists.train_length()
+    there, track, length = np.ones(len(stack.row), bool), on_track.track(p.rails, p.line.tracks), p.consists.train_length()
     lowest = float(track.limit[stack.ways.edge].min())
-    formed, tallied = stack.formed, None
-    for k in range(run.steps + 1):
-        t, now, last = k * run.step_s, instants.get(k), k == run.steps
-        position, speed = _measured(stack.ways, row, lane_position, p.consists.first, own)
+    s = abreast.initial()
+    tallied = units.watched(stack, p.scene(s.own, stack.links, 0.0)) if p.has_units else None
+    while True:
+        t, now, last = s.k * run.step_s, instants.get(s.k), s.k == run.steps
+        speed = p.speeds(s.own)
         if speed.max() > lowest + ROUNDING:
-            limit, _ = on_track.limits(track, stack.ways, row, position, length, there)
+            limit, _ = on_track.limits(track, stack.ways, s.row, s.position, length, there)
             counts.violated[speed > limit + ROUNDING] |= count.ABOVE_LIMIT
-        if k == 0:
-            scene = p.scene(own, stack.links, t)
-            formed = formed._replace(constants=p.law.constants(p.params, scene))
-            state = moving.relinked(scene, formed.constants, state)
-            tallied = units.watched(stack, scene) if p.has_units else None
-        past, state = (None, state) if now is None else moving.taken(state)
-        motion, acting, force, saturated = None, None, nobody, demand.saturated
-        if not last:
-            acting = disturbance.at(stack.signals, k, t, position)
-            if p.sampled and k % run.held_steps == 0:
-                believed = moving.believed_resistance(own)
-                demand, formed, messages, memory = control.evaluated(k, t, own, believed, formed, messages, memory, acting)
-                demand = control.clamped(demand, own, believed)
-            moved = moving.step(k, t, own, demand, nobody, formed, messages, state, acting)
-            motion, messages, state = moved.motion, moved.messages, moved.state
-            force, saturated = motion.input, demand.saturated | motion.limited
-        count.watch(fixed, position, speed, force, not last, counts)
+        past = None
         if now is not None:
-            count.count(fixed, now, position, speed, force, saturated, counts)
-            recorded.position[now.number] = position
+            past, taken = abreast.plant.taken(s.plant)
+            s = s._replace(plant=taken)
+        stepped = None if last else abreast.after(s)
+        motion, acting = (None, None) if stepped is None else (stepped.motion, stepped.acting)
+        force = abreast.free if motion is None else motion.input
+        saturated = s.demand.saturated if stepped is None else stepped.saturated
+        count.watch(fixed, s.position, speed, force, not last, counts)
+        if now is not None:
+            count.count(fixed, now, s.position, speed, force, saturated, counts)
+            recorded.position[now.number] = s.position
         if tallied is not None:
-            seen = Seen(position, stack.ways.edge[row], row, there)
+            seen = Seen(s.position, stack.ways.edge[s.row], s.row, there)
             instant = Row(
-                t, seen, formed.formation, own, speed, formed.ahead, stack.links, motion, saturated, past, acting, formed.led
+                t, seen, s.formed.formation, s.own, speed, s.formed.ahead, stack.links, motion, saturated, past, acting,
+                s.formed.led,
             )  # fmt: skip
             units.count(stack, tallied[0], instant, tallied[1], counts)
-        if not last:
-            if tallied is not None:
-                units.check(tallied[0], moved.own, state.estimate, counts)
-            numeric.go_on(stack.ways, p.line.length_m, moved.motion.displacement, row, lane_position)
-            own = moved.own
+        if stepped is None:
+            break
+        if tallied is not None:
+            units.check(tallied[0], stepped.state.own, stepped.state.plant.estimate, counts)
+        s = stepped.state
     bits = counts.violated.reshape(len(stack.runs), -1)
     violations = _violations(stack, counts)
     if tallied is not None:
         violations += units.violations(*tallied, len(stack.runs))
     return Done(
-        own, measures.metrics(stack, fixed, chained, counts, recorded, tallied), violations,
-        (bits & count.ABOVE_LIMIT > 0).sum(axis=1), _why_alone(stack, counts.fate, row, lane_position),
+        s.own, measures.metrics(stack, fixed, chained, counts, recorded, tallied), violations,
+        (bits & count.ABOVE_LIMIT > 0).sum(axis=1), _why_alone(abreast, s, counts.fate),
     )  # fmt: skip
 
 
 @njit(cache=True)
-def _measured(ways: Ways, row: Ints, lane_position: Floats, first: Ints, own: Floats) -> tuple[Floats, Floats]:
-    """Shift every train in ``own`` (U, s) onto its place, as ``loop`` does; positions [m] and speeds [m/s] of the heads, (N,)."""
-    position, speed = np.empty(len(row)), np.empty(len(row))
+def _measured(ways: Ways, row: Ints, lane_position: Floats, first: Ints, own: Floats) -> Floats:
+    """Shift every train in ``own`` (U, s) onto its place, as ``loop`` does; positions of the heads [m], (N,)."""
+    position = np.empty(len(row))
     for i in range(len(row)):
-        position[i], speed[i] = ways.begin[row[i]] + lane_position[i], own[first[i], SPEED]
+        position[i] = ways.begin[row[i]] + lane_position[i]
         shift = position[i] - own[first[i], POSITION]
         for u in range(first[i], first[i + 1]):
             own[u, POSITION] += shift
-    return position, speed
+    return position
 
 
 def _instants(p: Model, times: Floats) -> list[Instant]:
@@ -147,14 +221,13 @@ def _violations(stack: Stack, counts: count.Counts) -> Ints:
     return found
 
 
-def _why_alone(stack: Stack, fate: Ints, row: Ints, lane_position: Floats) -> tuple[str | None, ...]:
+def _why_alone(abreast: Abreast, s: State, fate: Ints) -> tuple[str | None, ...]:
     """Runs that cannot be told from here, and why."""
-    line, n = stack.model.line, stack.trains
-    ends = stack.ways.first[1:] - 1
-    off = (row == ends) & (lane_position > line.length_m[stack.ways.edge[ends]] - LEAVES_M)
+    stack = abreast.stack
+    line, n, off = stack.model.line, stack.trains, abreast.left(s)
     track = np.array([line.track_ids.index(name) for name in line.tracks])[stack.ways.edge]
     changes = np.add.accumulate(np.concatenate([[0], np.diff(track) != 0]))  # of track, along the ways
-    changed = changes[row] > changes[stack.row]
+    changed = changes[s.row] > changes[stack.row]
     words = {count.TOUCHES: "trains touch or pass one another", count.NOT_FINITE: "its numbers are no longer finite"}
     left = {True: "a train changes track", False: None}
 

@@ -1,4 +1,4 @@
-"""Who stands at which platform, and when: the timetable of the stations, planned against actual."""
+"""Which train stands at which platform, and when: the timetable of the stations, planned against actual."""
 
 from __future__ import annotations
 

@@ -77,7 +77,10 @@ def inside(onward: Ints, front: float, internal: Bools, length_m: Floats) -> flo
     return float(length_m[behind[internal[behind]]].sum())
 
 
-def yard(leg: Ints, begin: Floats, onward: Ints, twin: Ints, internal: Bools, length_m: Floats, length: float) -> Yard:
+def yard(
+    leg: Ints, begin: Floats, onward: Ints, twin: Ints, internal: Bools, length_m: Floats, length: float,
+    before: Sequence[Sequence[int]] = (),
+) -> Yard:  # fmt: skip
     """Where a train may turn.
 
     Parameters
@@ -92,7 +95,10 @@ def yard(leg: Ints, begin: Floats, onward: Ints, twin: Ints, internal: Bools, le
         Of the net, as in ``Rails``.
     length : float
         Of the train [m].
+    before : sequence of sequences of int
+        Edges that lead into each: where these are known a train may hang out behind the beginning of its way, as it enters.
     """
+    leg, begin = _with_what_lies_behind(leg, begin, onward, twin, length_m, length, before)
     rows = min(len(leg), int((~internal[onward]).sum()))
     common = 0
     while common < rows and twin[leg[-1 - common]] == onward[common]:
@@ -108,3 +114,22 @@ def yard(leg: Ints, begin: Floats, onward: Ints, twin: Ints, internal: Bools, le
         if first <= last:
             found.append((first, last))
     return Yard(np.array(found).reshape(-1, 2))
+
+
+def _with_what_lies_behind(
+    leg: Ints, begin: Floats, onward: Ints, twin: Ints, length_m: Floats, length: float, before: Sequence[Sequence[int]]
+) -> tuple[Ints, Floats]:
+    """A leg on from its beginning to where the rear of a train may be, if the train runs back over all of it.
+
+    No farther than the first switch: where SUMO takes such a train to be beyond is not known.
+    """
+    if not np.array_equal(twin[leg[::-1]], onward[: len(leg)]):
+        return leg, begin
+    end, behind, starts = float(begin[-1] + length_m[leg[-1]]), leg.tolist(), begin.tolist()
+    for there in onward[len(leg) :].tolist() if len(before) else []:
+        edge = int(twin[there])
+        others = [e for e in before[behind[0]] if e != twin[behind[0]]]
+        if starts[0] <= end - length or others != [edge]:
+            break
+        behind, starts = [edge, *behind], [starts[0] - float(length_m[edge]), *starts]
+    return np.array(behind, np.int64), np.array(starts)

@@ -193,7 +193,7 @@ def _allowed(
         limit, at = min(force)
         v = min(limit - below, cap)
         if v <= 0.0:
-            raise ValueError(f"the limit of {limit:.10g} m/s at {at:.10g} m leaves nothing {below:g} m/s below it")
+            raise ValueError(f"the limit of {limit:.10g} m/s at {at:.10g} m is not above below_limit_mps = {below:g}")
         if found and found[-1][2] == v:
             a = found.pop()[0]
         found.append((a, b, v))

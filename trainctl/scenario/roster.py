@@ -15,6 +15,7 @@ from sumo_net import Line, LineError, Rails
 from sumo_net.layout import Gradient
 from trainctl.errors import InputError
 from trainctl.railway import turning
+from trainctl.railway.turning import Yard
 from trainctl.scenario import mixed, passages
 from trainctl.scenario.tables import Scenario, TrafficTable, Train, TrainType
 from trainctl.scenario.train_types import fitted, train_type
@@ -209,6 +210,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         if event.train in ids and driven[ids.index(event.train)]
     ]
     trains, routes, stops, arrival = list[Train](), list[tuple[tuple[str, ...], ...]](), list[tuple[Stop, ...]](), list[float]()
+    placed_m = list[float]()
     factor = np.array([min(traffic.kinds[d.kind].speed_factor, 1.0) for d in traffic.departures])
     for d, share, other in zip(traffic.departures, factor.tolist(), driven.tolist(), strict=True):
         try:
@@ -216,6 +218,10 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
             cuts = frozenset() if other else rails.reversal
             parts = [np.array(leg, np.int64) for leg in turning.legs(rails.way(d.edges).tolist(), cuts)]
             begins = [rails.start_m[w[0]] + np.concatenate([[0.0], np.cumsum(rails.length_m[w[:-1]])]) for w in parts]
+            yards = _yards(parts, begins, rails, types.get(d.kind))
+            found += _too_long(d.id, parts, yards, rails, types.get(d.kind))
+            if len(parts) > 1 and len(parts[0]) == 1 and len(yards[0].places):  # it turns where it begins
+                d = d._replace(position_m=min(d.position_m, yards[0].last - float(begins[0][0])))
             way, begin = parts[-1], begins[-1]
             there = float(rails.length_m[way[-1]]) if d.arrival_m is None else d.arrival_m
             # As in SUMO a train that stops beyond the place where it is to leave leaves there.
@@ -225,10 +231,10 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
             ends = [float(b[-1] + rails.length_m[w[-1]]) for b, w in zip(begins, parts, strict=True)]
             ends[-1] = float(begin[-1]) + min(arrival[-1], float(rails.length_m[way[-1]]))
             stops.append(_before_the_ends(halts, ends))
-            found += _too_long(d.id, parts, begins, rails, types.get(d.kind))
         except ValueError as error:
             found.append(f"network.sumocfg: train {d.id}: {error}")
             continue
+        placed_m.append(d.position_m)
         routes.append(tuple(tuple(rails.edges[e] for e in part.tolist()) for part in parts))
         trains.append(
             Train(
@@ -265,7 +271,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
     roster = Roster(
         depart=np.array([max(d.depart_s - traffic.begin_s, 0.0) for d in departures]),
         edge=np.array([rails.index[d.edges[0]] for d in departures], np.int64),
-        lane_position=np.array([d.position_m for d in departures]),
+        lane_position=np.array(placed_m),
         arrival=np.array(arrival),
         like=tuple(d.like for d in departures),
         speed=np.array([math.nan if d.speed_mps is None else d.speed_mps for d in departures]),
@@ -364,17 +370,26 @@ def _stops(departure: Departure, rails: Rails, parts: list[Ints], begins: list[F
     return tuple(found)
 
 
-def _too_long(train: str, parts: list[Ints], begins: list[Floats], rails: Rails, of: TrainType | None) -> list[str]:
+def _yards(parts: list[Ints], begins: list[Floats], rails: Rails, of: TrainType | None) -> list[Yard]:
+    """Where a train may make its turns."""
+    return [
+        turning.yard(leg, begin, onward, rails.twin, rails.internal, rails.length_m, _length(of), rails.before)
+        for leg, begin, onward in zip(parts, begins, parts[1:], strict=False)
+    ]
+
+
+def _length(of: TrainType | None) -> float:
+    return 0.0 if of is None else float(of.per_unit("unit_length_m").sum())
+
+
+def _too_long(train: str, parts: list[Ints], yards: list[Yard], rails: Rails, of: TrainType | None) -> list[str]:
     """Turns that a train is too long for."""
-    length, found = 0.0 if of is None else float(of.per_unit("unit_length_m").sum()), []
-    for leg, begin, onward in zip(parts, begins, parts[1:], strict=False):
-        yard = turning.yard(leg, begin, onward, rails.twin, rails.internal, rails.length_m, length)
-        if not len(yard.places):
-            found.append(
-                f"network.sumocfg: train {train}: cannot turn back from edge {rails.edges[leg[-1]]} to edge"
-                f" {rails.edges[onward[0]]}: its {length:g} m do not fit on the track that its route runs back over"
-            )
-    return found
+    return [
+        f"network.sumocfg: train {train}: cannot turn back from edge {rails.edges[leg[-1]]} to edge"
+        f" {rails.edges[onward[0]]}: its {_length(of):g} m do not fit on the track that its route runs back over"
+        for leg, onward, yard in zip(parts, parts[1:], yards, strict=False)
+        if not len(yard.places)
+    ]
 
 
 def _changes(scenario: Scenario, traffic: Configuration) -> tuple[str, ...]:

@@ -102,7 +102,7 @@ class TrafficTable(Table):
         return below
 
     cooperate: tuple[str, ...] = Field(
-        ("*",), description="Trains that join formations, by id; * stands for anything. The others are driven by themselves."
+        ("*",), description="Trains that join formations, by id; * stands for anything. The others drive alone."
     )
     others: Literal["driven", "sumo"] = Field(
         "driven",

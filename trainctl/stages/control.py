@@ -3,22 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from trainctl.errors import LawError
 from trainctl.scenario.model import Model
-from trainctl.signals import POSITION, SPEED, Demand, Disturbed, Floats, Formed, Messages, Trains
+from trainctl.signals import POSITION, SPEED, Demand, Disturbed, Floats, Formed, Links, Messages, Trains
 from trainctl.topology import exchange
 from trainctl.topology.exchange import Radio
 
 
-class Control:
-    """Sampled laws; continuous ones are evaluated inside the plant's step."""
+class Exchanged(NamedTuple):
+    """What every train knows at a control instant, once messages have been exchanged."""
 
-    def __init__(self, p: Model, radio: Radio) -> None:
-        self.p, self.radio = p, radio
+    trains: Trains  # of itself
+    leader: Floats  # (4,) or (4, n) of its reference
+    said: Floats  # (n, w) what it says
+    links: Links  # with ``heard`` of this instant
+    messages: Messages
+    memory: Any
+
+
+class Control:
+    """Sampled laws; continuous ones are evaluated inside the plant's step.
+
+    ``strict``: a number of the law's that is not finite is an error at once; else whoever steps looks at what comes of it.
+    """
+
+    def __init__(self, p: Model, radio: Radio, strict: bool = True) -> None:
+        self.p, self.radio, self.strict = p, radio, strict
+        self.asked: tuple[Any, ...] = (None,) * 6  # of the last exchange, and what came of it
+        self.answer: Exchanged | None = None
         self.clamps = getattr(p.law, "CLAMPED", False) and not p.plant.CLAMPS  # else the plant does
 
     def initial(self) -> Demand:
@@ -28,7 +44,7 @@ class Control:
 
     def step(
         self, k: int, t: float, own: Floats, resistance: Callable[[Floats], Floats], formed: Formed, messages: Messages,
-        demand: Demand, memory: Any, commanded: Floats, disturbed: Disturbed,
+        demand: Demand, memory: Any, commanded: Floats, added: Floats, disturbed: Disturbed,
     ) -> tuple[Demand, Formed, Messages, Any]:  # fmt: skip
         """Demand of this step, held over the control period.
 
@@ -46,6 +62,8 @@ class Control:
             Formations, messages under way, what was asked before, the law's own state.
         commanded : ndarray, shape (n,)
             Accelerations set from outside [m/s2], NaN where none: they take the place of the law's.
+        added : ndarray, shape (n,)
+            Added from outside to what the law asks for, at control instants [m/s2].
         disturbed : Disturbed
             For the error of the measured positions.
         """
@@ -53,7 +71,10 @@ class Control:
         if self.p.sampled and k % run.held_steps == 0:
             believed = resistance(own)
             demand, formed, messages, memory = self.evaluated(k, t, own, believed, formed, messages, memory, disturbed)
-            self._check(t, demand)
+            if self.strict:
+                self._check(t, demand)
+            if added.any():
+                demand = demand._replace(acceleration=demand.acceleration + added)
             demand = self.clamped(demand, own, believed)
         free = np.isnan(commanded)
         if not free.all():
@@ -66,23 +87,44 @@ class Control:
         disturbed: Disturbed,
     ) -> tuple[Demand, Formed, Messages, Any]:  # fmt: skip
         """What the law asks for in the step ``k``, as it is; arguments as those of ``step``, ``resistance`` (n,) for ``own``."""
-        assert formed.links is not None
-        p, law, leading = self.p, self.p.law, own[self.p.leading]
-        leader = formed.references.leader(t)
-        trains = Trains(leading[:, POSITION] + disturbed.measurement, leading[:, SPEED], resistance)
-        if p.remembers and k == 0:
-            memory = law.initial(p.params, p.scene(own, formed.links, t))
-        sent = law.message(formed.constants, trains, leader, *((memory,) if p.remembers else ()))
-        number = k // p.scenario.run.held_steps
-        messages, heard = exchange.deliver(
-            self.radio, messages, sent, trains.position, formed.links, number, t, trains.position - leader[POSITION]
-        )
-        links = formed.links._replace(heard=heard)
-        if p.remembers:
+        law = self.p.law
+        trains, leader, _, links, messages, memory = self.exchanged(
+            k, t, own, resistance, formed, messages, memory, disturbed
+        )  # fmt: skip
+        if self.p.remembers:
             demand, memory = law.demand(formed.constants, trains, leader, links, messages.heard, memory)
         else:
             demand = law.demand(formed.constants, trains, leader, links, messages.heard)
         return demand, formed._replace(links=links), messages, memory
+
+    def exchanged(
+        self, k: int, t: float, own: Floats, resistance: Floats, formed: Formed, messages: Messages, memory: Any,
+        disturbed: Disturbed,
+    ) -> Exchanged:  # fmt: skip
+        """What every train knows in the step ``k``; arguments as those of ``evaluated``.
+
+        An exchange is a function of its arguments, and done once where agents look before the law is asked.
+        """
+        assert formed.links is not None
+        same = k, formed, messages, memory
+        if (
+            self.answer is not None and all(a is b for a, b in zip(same, self.asked[:4], strict=True))
+            and np.array_equal(own, self.asked[4]) and np.array_equal(disturbed.measurement, self.asked[5])
+        ):  # fmt: skip
+            return self.answer
+        p, law = self.p, self.p.law
+        leader = formed.references.leader(t)
+        trains = Trains(p.fronts(own) + disturbed.measurement, p.speeds(own), resistance)
+        if p.remembers and k == 0:
+            memory = law.initial(p.params, p.scene(own, formed.links, t))
+        said = law.message(formed.constants, trains, leader, *((memory,) if p.remembers else ()))
+        number = k // p.scenario.run.held_steps
+        arrived, heard = exchange.deliver(
+            self.radio, messages, said, trains.position, formed.links, number, t, trains.position - leader[POSITION]
+        )
+        self.asked = *same, own, disturbed.measurement
+        self.answer = Exchanged(trains, leader, said, formed.links._replace(heard=heard), arrived, memory)
+        return self.answer
 
     def _check(self, t: float, demand: Demand) -> None:
         wrong = np.flatnonzero(~np.isfinite(demand.acceleration))

@@ -129,7 +129,7 @@ def _unit_lost(tables: Tables, line: Tables, runs: int) -> None:
 
 
 def _mass_off(tables: Tables, line: Tables, runs: int) -> None:
-    """The first train brakes as in service; every train is 5 % heavier or lighter than stated, and nobody knows."""
+    """The first train brakes as in service; every train is 5 % heavier or lighter than stated, and no law knows."""
     _stop(tables, line, runs)
     for name, kind in tables["train_type"].items():
         k, i = (int(part) for part in name[1:].split("."))

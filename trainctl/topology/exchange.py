@@ -122,17 +122,26 @@ def deliver(
     spoke, said, quiet = _who_sends(radio, messages, place, out)
     under_way = (*messages.sent, sent)[-radio.oldest - 1 :]
     who = (*messages.spoke, spoke)[-radio.oldest - 1 :]
-    age = np.full(rows, -1)
-    reaches = reach(position, links, radio.radius) if np.isfinite(radio.radius) else np.ones(rows, bool)
+    age, told = np.full(rows, -1), np.array(who) if len(who) > 1 else spoke[None]
+    reaches = reach(position, links, radio.radius) if math.isfinite(radio.radius) else np.ones(rows, bool)
     _arrive(
         radio.loss, radio.bad_loss, radio.turns_bad, radio.turns_good, radio.delay, radio.spread, radio.exponential, radio.key,
-        radio.names, links.sender, links.receiver, count, np.array(who), out, reaches, newest, bad, age,
+        radio.names, links.sender, links.receiver, count, told, out, reaches, newest, bad, age,
     )  # fmt: skip
     arrives = age >= 0
-    for a in np.unique(age[arrives]).tolist():
-        np.copyto(heard, under_way[-1 - a][links.sender], where=(age == a)[:, None])
-    counted = messages.counted + np.array([int(spoke.sum()), int(arrives.sum())])
+    for a in range(radio.delay, len(under_way)):
+        _take(age, a, under_way[-1 - a], links.sender, heard)
+    counted = messages.counted + (np.count_nonzero(spoke), np.count_nonzero(arrives))
     return Messages(under_way, heard, ever | arrives, newest, bad, who, said, quiet, counted), arrives
+
+
+@njit(cache=True)
+def _take(age: Ints, a: int, sent: Floats, sender: Ints, heard: Floats) -> None:
+    """Write into ``heard`` (L, w) what the links bring whose message is of the age ``a``, as ``sent`` (n, w) then."""
+    for k in range(len(age)):
+        if age[k] == a:
+            for c in range(sent.shape[1]):
+                heard[k, c] = sent[sender[k], c]
 
 
 def _who_sends(radio: Radio, messages: Messages, place: Floats, out: Bools) -> tuple[Bools, Floats, Ints]:

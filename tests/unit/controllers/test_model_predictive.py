@@ -110,6 +110,20 @@ def test_behind_a_first_train_that_stops_nobody_comes_within_the_margin() -> Non
     assert np.all(string.own[:, 1] < 0.1)
 
 
+def test_what_pushes_does_not_take_it_past_its_maximum_speed() -> None:
+    """A force nobody knows of, with the train ahead far away: a bound that gave way each time would let the speed grow for ever."""
+    string, fast = String(law, P, scene(2, 400.0)), []
+    string.own[1, 0] -= 3000.0
+    for _ in range(300):
+        string.step(push=0.05)
+        fast.append(float(string.own[1, 1]))
+    assert max(fast) == pytest.approx(40.0 + 0.6 * 8.0 + 0.05, abs=1e-3)  # the part of the room, and what a period's push adds
+    string.own[1, 1] = 50.0  # above the bound: it comes back
+    for _ in range(60):
+        string.step()
+    assert string.own[1, 1] <= 40.0 + 0.6 * 8.0 + ROUNDING
+
+
 def test_it_takes_at_most_0_3_ms_per_train_and_step() -> None:
     """Six trains that close up and brake: the median over the steps."""
     string, took = String(law, P, scene(6, 350.0)), []

@@ -109,7 +109,7 @@ def test_cap_and_distance_below_the_limits():
     [
         ({"speed": 25.0}, "starts with 25 m/s, but the limits ahead allow 20 m/s"),
         ({"position": 4900.0}, r"the limits ahead allow 14.14213562 m/s at 4900 m when braking with 0.5 m/s2"),
-        ({"below": 10.0}, "the limit of 10 m/s at 5000 m leaves nothing 10 m/s below it"),
+        ({"below": 10.0}, "the limit of 10 m/s at 5000 m is not above below_limit_mps = 10"),
         ({"stop": -5.0}, "stops at -5 m, at or behind its start"),
     ],
 )

@@ -43,6 +43,7 @@ class Asked:
         s = loop.state
         self.p, self.control, self.own, self.formed, self.messages = p, loop.control, s.own, s.formed, s.messages
         self.demand, self.memory = loop.control.initial(), ()
+        self.added = np.zeros(len(p.scenario.ids))
         self.commanded, self.resistance = np.full(len(p.scenario.ids), np.nan), loop.plant.believed_resistance
 
     def step(self, k, error=0.0):
@@ -50,7 +51,17 @@ class Asked:
         zero = np.zeros(n)
         acting = Disturbed(zero, zero, zero, zero + 1.0, zero + error)
         self.demand, self.formed, self.messages, self.memory = self.control.step(
-            k, float(k), self.own, self.resistance, self.formed, self.messages, self.demand, self.memory, self.commanded, acting
+            k,
+            float(k),
+            self.own,
+            self.resistance,
+            self.formed,
+            self.messages,
+            self.demand,
+            self.memory,
+            self.commanded,
+            self.added,
+            acting,
         )
         return self.demand.acceleration
 
@@ -108,7 +119,9 @@ def test_a_continuous_law_is_not_asked_here():
     p = open_scenario("emu_finite_time")
     control = Control(p, p.radio)
     demand = control.initial()
-    same = control.step(0, 0.0, p.own, None, None, None, demand, (), np.full(len(p.scenario.ids), np.nan), None)
+    same = control.step(
+        0, 0.0, p.own, None, None, None, demand, (), np.full(len(p.scenario.ids), np.nan), np.zeros(len(p.scenario.ids)), None
+    )
     assert same == (demand, None, None, ())
 
 
