@@ -263,8 +263,8 @@ def test_signals_let_trains_turn_one_after_the_other_as_in_plain_sumo(net, other
     assert (held or others == "sumo") and all(e["other"] not in (None, e["train"]) for e in held)
 
 
-def stub(folder: Path, signals: str = "ad") -> None:
-    """A way in over ``a`` and a way out, single track behind them with a signal in ``d``, and a terminal: two trains turn there."""
+def stub(folder: Path, signals: str = "ad", number: int = 2) -> None:
+    """A way in over ``a`` and a way out, single track behind them with a signal in ``d``, and a terminal: trains turn there."""
     nodes = {
         "i": (-400, 0),
         "a": (0, 0),
@@ -279,8 +279,16 @@ def stub(folder: Path, signals: str = "ad") -> None:
     ways = {"ia": ("i", "a"), "ab": ("a", "b"), "bo": ("b", "o"), "oq": ("o", "q")}
     nets.net(folder, nodes, track | ways, nets.TERMINALS, signals=signals)
     way = "ia ab bc cd de -de -cd -bc bo oq"
-    trains = [nets.train(f"t{k}", way, 30 * k, halts("de", duration=10), departSpeed=0) for k in range(2)]
+    trains = [nets.train(f"t{k}", way, 30 * k, halts("de", duration=10), departSpeed=0) for k in range(number)]
     nets.traffic(folder, "".join(trains))
+
+
+def test_a_train_that_is_alone_needs_no_signal_before_its_own_way_back(tmp_path):
+    stub(tmp_path, "d", 1)
+    assert opened_in(tmp_path, "robust_constrained", 100, traffic={"signals": "obey", "cooperate": []}).obeys
+    stub(tmp_path, "d", 2)
+    with pytest.raises(InputError, match=r"no rail signal stands before edge :b_.* for train t0 and 1 more"):
+        opened_in(tmp_path, "robust_constrained", 100, traffic={"signals": "obey", "cooperate": []})
 
 
 def test_signals_keep_others_out_of_where_a_train_comes_back_to(tmp_path):
