@@ -37,7 +37,8 @@ this checkout over the other, with the minimum and the maximum. Closing the logs
 times (a cache miss is not seen), but the same whatever else the machine does: they tell whether a change made anything cheaper.
 Nothing is closed, and SUMO behind TraCI is not counted.
 
-``--logs`` measures how fast logs are read instead (``tools/bench_logs.py``).
+``--logs`` measures how fast logs are read instead (``tools/bench_logs.py``), ``--country`` what a day of a country costs
+(``tools/bench_country.py``), ``--kernels`` trains of units on one core and on two (``tools/bench_kernels.py``).
 """
 
 from __future__ import annotations
@@ -100,17 +101,18 @@ def steps_of(case: str, trains: int) -> int:
 # Scenarios
 
 
-def scenario(case: str, trains: int, steps: int) -> tuple[str, str]:
+def scenario(case: str, trains: int, steps: int, tracks: int = 3) -> tuple[str, str]:
     """TOML of the scenario and of its line: trains take turns on the tracks, a little off their slots."""
     if case in COMING:
         alone = '[traffic]\ncooperate = []\nsignals = "{}"\n'.format("obey" if case == "obeying" else "ignore")
         run = f"[run]\nduration_s = {steps}\nstep_s = 1.0\ncontrol_period_s = 8.0\n"
         return f"{_TRAFFIC}{run}{alone if case in SIGNALLED else ''}", ""
-    spacing, rows = SPACING_M[case], -(-trains // 3)
+    spacing, rows = SPACING_M[case], -(-trains // tracks)
     slots = case in ("finite_time", "actuated_units")  # these laws want one slot per train, whatever its track
     front = 1000.0 + (trains if slots else rows) * spacing
     line = (
-        f'name = "bench_three_tracks"\ntracks = [2, 1, 3]\nlength_m = {front + 100.0 * (steps + 2) + 5000.0}\nstart_m = 0.0\n'
+        f'name = "bench_three_tracks"\ntracks = {[2, 1, *range(3, tracks + 1)]}\n'
+        f"length_m = {front + 100.0 * (steps + 2) + 5000.0}\nstart_m = 0.0\n"
         f"max_edge_m = {EDGE_M}\nspeed = [[0.0, 100.0]]\n"
     )
     body = [
@@ -121,9 +123,9 @@ def scenario(case: str, trains: int, steps: int) -> tuple[str, str]:
     ]
     for i in range(trains):
         wiggle = (i * 7919 % 201 - 100) / 100.0  # -1 .. 1, the same everywhere
-        position = front - (i if slots else i // 3) * spacing + 20.0 * wiggle
+        position = front - (i if slots else i // tracks) * spacing + 20.0 * wiggle
         speed = SPEED_MPS + (i * 104_729 % 201 - 100) / 100.0
-        track = (1, 2, 3)[i // rows if slots else i % 3]
+        track = 1 + (i // rows if slots else i % tracks)
         body.append(f'[[train]]\nid = {i + 1}\ntype = "train"\ntrack = {track}\nposition_m = {position}\nspeed_mps = {speed}')
     return "\n".join(body) + "\n", line
 
@@ -739,10 +741,19 @@ def main() -> None:
     parser.add_argument("--instructions", action="store_true", help="count instructions with valgrind: repeatable, but slow")
     parser.add_argument("--logs", type=float, nargs="?", const=40.0, metavar="MB", help="how fast logs of this size are read")
     parser.add_argument("--ensembles", type=int, nargs="?", const=1000, metavar="RUNS", help="how fast runs side by side are")
+    parser.add_argument("--environment", type=int, nargs="?", const=1000, metavar="RUNS", help="how fast agents step")
+    parser.add_argument(
+        "--country", type=float, nargs="?", const=1.0, metavar="HOURS", help="a day of a country, so many hours of it"
+    )
+    parser.add_argument(
+        "--kernels", type=int, nargs="?", const=999, metavar="TRAINS", help="trains of units on one core and on two"
+    )
     parser.add_argument("--json", action="store_true", help="print a list of rows for machines")
     parser.add_argument("--case", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--public", nargs=3, help=argparse.SUPPRESS)
     parser.add_argument("--inputs", nargs=4, help=argparse.SUPPRESS)
+    parser.add_argument("--roster", nargs="+", help=argparse.SUPPRESS)
+    parser.add_argument("--kernel", nargs=3, help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.inputs:
         case, folder, trains, steps = asked.inputs
@@ -754,11 +765,36 @@ def main() -> None:
         case, folder, checkout = asked.public
         of_this(Path(checkout))
         child(case, Path(folder), public)
+    elif asked.roster:
+        import bench_country
+
+        bench_country.of_roster(Path(asked.roster[0]), asked.roster[1:])
+    elif asked.kernel:
+        import bench_kernels
+
+        bench_kernels.child(*asked.kernel)
+    elif asked.kernels is not None:
+        import bench_kernels
+
+        with tempfile.TemporaryDirectory(prefix="trainctl-bench-") as root:
+            rows = bench_kernels.rows(Path(root), asked.kernels, asked.repeats or 5)
+        print(json.dumps(rows, indent=2) if asked.json else bench_kernels.table(rows))
+    elif asked.country is not None:
+        import bench_country
+
+        with tempfile.TemporaryDirectory(prefix="trainctl-bench-") as root:
+            rows = bench_country.rows(Path(root), asked.country, asked.repeats or 3)
+        print(json.dumps(rows, indent=2) if asked.json else bench_country.table(rows))
     elif asked.ensembles is not None:
         import bench_ensembles
 
         rows = bench_ensembles.ensembles(asked.ensembles, asked.repeats or 3)
         print(json.dumps(rows, indent=2) if asked.json else bench_ensembles.table(rows))
+    elif asked.environment is not None:
+        import bench_environment
+
+        rows = bench_environment.environment(asked.environment, asked.repeats or 5)
+        print(json.dumps(rows, indent=2) if asked.json else bench_environment.table(rows))
     elif asked.logs is not None:
         import bench_logs
 

@@ -68,8 +68,9 @@ class ContinuousLaw(Protocol):
 
     Arrays ``own``, ``estimate``, ``correction`` and ``out`` hold the units of train ``i`` only, ``desired`` and ``heard``
     what its links bring: locality by construction. ``constants`` is a NamedTuple of floats and arrays made by ``constants()``;
-    per-unit arrays in it are indexed from its own ``first[i]``. ``leader`` is (4,): position, speed, acceleration, jerk of the
-    reference now; ``slot`` the train's nominal position relative to it [m].
+    per-unit arrays in it are indexed from its own ``first[i]``. Nothing is written into it but the fields that ``WORK`` names,
+    of which every thread has its own; a law without ``WORK``, a tuple of names, is integrated by one thread. ``leader`` is (4,):
+    position, speed, acceleration, jerk of the reference now; ``slot`` the train's nominal position relative to it [m].
     """
 
     CLOCK: Literal["continuous"]

@@ -21,8 +21,9 @@ from numba.core import caching
 config: Any = numba.config
 Index: Any = caching.IndexDataCacheFile
 
-#: ``njit`` without numba's run time, its allocation and reference counts, for what is called in every Runge-Kutta stage.
-bare: Any = partial(numba.njit, cache=True, _nrt=False)
+#: ``njit`` without numba's run time, its allocation and reference counts, for what is called in every Runge-Kutta stage; it
+#: leaves Python's lock to other threads.
+bare: Any = partial(numba.njit, cache=True, _nrt=False, nogil=True)
 
 #: The same for the functions of laws, observers and plants, with numpy's rules of division: put into the stage that calls them.
 inlined: Any = partial(bare, error_model="numpy", forceinline=True)

@@ -61,11 +61,13 @@ class Loop(Steps):
         SUMO, or the numeric stand-in.
     journal : Journal
         Where rows and events go.
+    goes_on : bool
+        Whether the trains are on the railway already.
     """
 
     state: State
 
-    def __init__(self, model: Model, world: World, journal: record.Journal) -> None:
+    def __init__(self, model: Model, world: World, journal: record.Journal, goes_on: bool = False) -> None:
         super().__init__(model, journal)
         self.world, self.built = world, model
         p, run = model, model.scenario.run
@@ -86,7 +88,8 @@ class Loop(Steps):
             commanded=np.full(len(p.scenario.ids), np.nan), added=np.zeros(len(p.scenario.ids)),
             plant=self.plant.initial(), watch=self.record.initial(),
         )  # fmt: skip
-        self._start()
+        if not goes_on:
+            self._start()
 
     def after(self, s: State) -> State:
         """The state a step later."""

@@ -10,6 +10,7 @@ import threading
 import time
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,6 +23,7 @@ from sumo_net import LineError
 from sumo_net.netfile import unpack
 from trainctl.compiling import compiling
 from trainctl.errors import InputError, SimulatorError, left_out
+from trainctl.in_service import loop_of
 from trainctl.loop import Loop
 from trainctl.metrics.run import metrics
 from trainctl.metrics.versions import VERSION
@@ -250,7 +252,7 @@ def _driven(
                 if every_s is not None:
                     world = tape = checkpoint.Tape(world, place, saved)
                 journal.silent = saved is not None  # what a run told when it began is written already
-                simulation = Loop(p, world, journal)
+                simulation = loop_of(p, world, journal)
                 if saved is not None and tape is not None:
                     checkpoint.restore(simulation, tape, saved)
                 journal.silent = False
@@ -429,10 +431,12 @@ def open_world(p: Model, folder: Path, backend: Backend, gui: str | None = None)
     """
     if backend == "numeric":
         return Numeric(p.line)
-    from trainctl.sumo.session import Sumo
-    from trainctl.sumo.signal_box import obeyed
+    with ThreadPoolExecutor(1) as beside:  # netconvert takes as long as loading SUMO does
+        made = beside.submit(_net, p, folder)
+        from trainctl.sumo.session import Sumo
+        from trainctl.sumo.signal_box import obeyed
 
-    run, (net, place) = p.scenario.run, _net(p, folder)
+    run, (net, place) = p.scenario.run, made.result()
     if gui is not None:
         from trainctl.sumo.gui import Gui, Map
 

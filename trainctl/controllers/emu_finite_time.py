@@ -67,6 +67,7 @@ IN_STOPS = (
 #: Columns of a message: head and tail relative to the leader (the tail moved forward by the units ahead of it), train length.
 HEAD, HEAD_SPEED, TAIL, TAIL_SPEED, LENGTH_OF_TRAIN = range(5)
 MESSAGE = 5
+WORK: tuple[str, ...] = ("terms",)
 
 #: Columns of ``Constants.units``.
 MASS, INERTIA, C0, C1, C2, LENGTH, K_HAT, PAIR, MEAN = range(9)

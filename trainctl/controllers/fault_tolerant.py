@@ -59,6 +59,7 @@ if TYPE_CHECKING:
 CLOCK: Literal["continuous"] = "continuous"
 ORDER: Literal["parallel", "chain"] = "chain"
 MESSAGE = 4
+WORK: tuple[str, ...] = ()
 WATCHED = ("spacing_error_m", "speed_error_mps", "q_error_mps")
 
 #: A train is linked only once (39) holds: the barrier has no value outside.
@@ -224,7 +225,7 @@ def demand(
         x, v, w, G = leader[0] + slot, leader[1], leader[2], leader[3]
     else:
         dx, dv, dw, dG = heard[k, 0], heard[k, 1], heard[k, 2], heard[k, 3]
-        fade = math.exp(-age / FADE)
+        fade = math.exp(-age / FADE) if age > 0.0 else 1.0
         x = leader[0] - desired[k] + dx + age * (dv + age * dw / 2.0)
         v = leader[1] + dv + age * dw
         w, G = leader[2] + dw + FADE * (1.0 - fade) * dG, leader[3] + fade * dG

@@ -42,7 +42,7 @@ TOUCH_M = 0.01
 
 
 class Pairs(NamedTuple):
-    """Pairs of trains that hear each other, Q in all runs, the one ahead first, as ``runs.series.pairs`` has them."""
+    """Pairs of trains that receive from each other, Q in all runs, the one ahead first, as ``runs.series.pairs`` has them."""
 
     ahead: Ints  # (Q,)
     behind: Ints  # (Q,)

@@ -30,7 +30,7 @@ class Stack(NamedTuple):
     """R runs of n trains each, N = R n in all."""
 
     runs: tuple[Model, ...]
-    model: Model  # of all N trains; its events, disturbances and seed are nobody's
+    model: Model  # of all N trains; its events, disturbances and seed count for none
     radio: Radio
     signals: Signals  # disturbances of all runs
     formed: Formed
@@ -45,7 +45,7 @@ class Stack(NamedTuple):
 
     @property
     def links(self) -> Links:
-        """Who hears whom."""
+        """Who receives from whom."""
         assert self.formed.links is not None
         return self.formed.links
 
@@ -60,7 +60,7 @@ def alone(p: Model) -> str | None:
     if p.supervision.mode != "off":
         return "supervisor.mode is not off"
     if any(not _at_once(event) and event.time_s < run.duration_s for event in p.scenario.event):
-        return "it has events on the way"
+        return "it has events during the run"
     if p.plant.noise_hold(p.plant_params) is not None:
         return "its plant has noise of its own"
     return None
@@ -187,7 +187,7 @@ class _Unheard(Journal):
         """Without a folder."""
 
     def event(self, time: float, kind: str, **fields: object) -> None:
-        """Nobody is told."""
+        """Nothing is reported."""
 
 
 def _links(runs: Sequence[Model], order: Ints, formation: Ints) -> Links:

@@ -23,6 +23,8 @@ from numba.extending import overload
 from trainctl.errors import LawError
 from trainctl.kernels import bare
 from trainctl.plants import shared
+from trainctl.plants.threads import ALONE, Shares
+from trainctl.plants.views import CORRECTION, ESTIMATE, OWN, UNITS, block, numbers
 from trainctl.signals import FORCE, POSITION, POWERS, SPEED, Bools, Extremes, Floats, Ints, Links, References, evaluate
 
 types: Any = numba.types
@@ -34,9 +36,6 @@ LAW, OBSERVER, PLANT = range(3)
 
 #: Held while numba's settings are those of one law.
 COMPILING = threading.Lock()
-
-#: Trains integrated together where they do not receive from each other: few enough for the second cache, enough to share the calls.
-TOGETHER = 64
 
 
 class Parts(NamedTuple):
@@ -139,50 +138,51 @@ def stage(code, loop, first, links, references, air, t, inside, own, estimate, w
     ordered = len(held) > 0
     for i in range(low, high):
         a, b = first[i], first[i + 1]
+        x, q = block(code, OWN, own, a, b), block(code, ESTIMATE, estimate, a, b)
         if observed:
+            still, x_rate = block(code, UNITS, work.held, a, b), block(code, OWN, work.own_rate, a, b)
             standing = False
-            for u in range(a, b):
-                work.held[u] = own[u, SPEED] <= 0.0
-                standing = standing or work.held[u]
+            for j in range(len(x)):
+                still[j] = x[j, SPEED] <= 0.0
+                standing = standing or still[j]
             if standing and own.shape[1] > FORCE:  # where the forces are a state they say whether a standing unit moves off
-                rate(i, loop.plant, t, inside, own[a:b], work.applied[a:b], work.own_rate[a:b], work.power[i])
-                for u in range(a, b):
-                    work.held[u] = own[u, SPEED] < 0.0 or (own[u, SPEED] == 0.0 and work.own_rate[u, SPEED] <= 0.0)
-            correction(i, loop.observer, own[a:b], estimate[a:b], work.held[a:b], work.correction[a:b])
+                rate(i, loop.plant, t, inside, x, block(code, UNITS, work.applied, a, b), x_rate, work.power[i])
+                for j in range(len(x)):
+                    still[j] = x[j, SPEED] < 0.0 or (x[j, SPEED] == 0.0 and x_rate[j, SPEED] <= 0.0)
+            correction(i, loop.observer, x, q, still, block(code, CORRECTION, work.correction, a, b))
         if talk and not air.chain:
             follows = lead(i, follows, references, t, inside, work.leader)
-            message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
+            q_rate = block(code, ESTIMATE, work.estimate_rate, a, b)
+            message(i, loop.law, work.leader, links.slot[i], x, q, q_rate, work.sent[i])
     for p in range(low, high):
         i = links.order[p] if talk else p
         a, b = first[i], first[i + 1]
         e, f = links.first[i], links.first[i + 1]
+        x, q, applied = block(code, OWN, own, a, b), block(code, ESTIMATE, estimate, a, b), block(code, UNITS, work.applied, a, b)
+        x_rate, q_rate = block(code, OWN, work.own_rate, a, b), block(code, ESTIMATE, work.estimate_rate, a, b)
+        corrected = block(code, CORRECTION, work.correction, a, b)
         if talk:
             for k in range(e, f):
-                for q in range(air.heard.shape[1]):
-                    air.heard[k, q] = work.sent[links.sender[k], q]
+                for w in range(air.heard.shape[1]):
+                    air.heard[k, w] = work.sent[links.sender[k], w]
         follows = lead(i, follows, references, t, inside, work.leader)
         demand(
-            i, loop.law, work.leader, age, links.slot[i], own[a:b], estimate[a:b], work.correction[a:b],
-            links.desired[e:f], air.heard[e:f], work.applied[a:b],
+            i, loop.law, work.leader, age, links.slot[i], x, q, corrected, links.desired[e:f], air.heard[e:f], applied,
         )  # fmt: skip
         if ordered and held[i] == held[i]:  # not NaN
             shared.demand(
-                i, loop.orders.held, work.leader, age, 0.0, own[a:b], estimate[a:b], work.correction[a:b], links.desired[e:f],
-                air.heard[e:f], work.applied[a:b],
+                i, loop.orders.held, work.leader, age, 0.0, x, q, corrected, links.desired[e:f], air.heard[e:f], applied,
             )  # fmt: skip
         else:
             add(lift, 1.0, a, b, work.applied)
-        work.limited[i] = 1.0 if limit(i, loop.plant, own[a:b], work.applied[a:b]) else 0.0
+        work.limited[i] = 1.0 if limit(i, loop.plant, x, applied) else 0.0
         if observed:
             add(lift, -1.0, a, b, work.applied)
-            estimate_rate(
-                i, loop.observer, own[a:b], estimate[a:b], work.held[a:b], work.correction[a:b], work.applied[a:b],
-                work.estimate_rate[a:b],
-            )  # fmt: skip
+            estimate_rate(i, loop.observer, x, q, block(code, UNITS, work.held, a, b), corrected, applied, q_rate)
             add(lift, 1.0, a, b, work.applied)
         if talk and air.chain:
-            message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
-        rate(i, loop.plant, t, inside, own[a:b], work.applied[a:b], work.own_rate[a:b], work.power[i])
+            message(i, loop.law, work.leader, links.slot[i], x, q, q_rate, work.sent[i])
+        rate(i, loop.plant, t, inside, x, applied, x_rate, work.power[i])
 
 
 @bare()
@@ -248,14 +248,14 @@ def talking(air):  # type: ignore[no-untyped-def]
 
 
 @bare()
-def advance_kernel(code, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes):  # type: ignore[no-untyped-def]
-    """See ``advance``. Trains that receive nothing meanwhile are taken a few at a time, so that they stay in the cache."""
-    trains = len(first) - 1
-    size = trains if talking(air) else TOGETHER
-    for low in range(0, trains, max(size, 1)):
+def advance_kernel(  # type: ignore[no-untyped-def]
+    code, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes, blocks
+):  # fmt: skip
+    """See ``advance``. ``blocks`` are the trains that blocks begin with, and the one behind the last: each stays in the cache."""
+    for k in range(len(blocks) - 1):
         stretch(
-            code, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes, low,
-            min(low + size, trains),
+            code, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes, blocks[k],
+            blocks[k + 1],
         )  # fmt: skip
 
 
@@ -348,12 +348,30 @@ def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...], ex
     They serve as long as the types of the arguments stay: new values, links and constants of the same shape of data need no
     new call. Compiled code is cached on disk between processes.
     """
-    code = described(law, observer, plant)
+    _, first, *_, own, estimate, work, _ = arguments
+    code = f"{described(law, observer, plant)} {numbers(first, own, estimate, work.correction)}"
     if config.DISABLE_JIT:
         return Parts(code, advance_kernel, exchange_kernel)
     loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes = (typeof(a) for a in arguments)
     text = types.literal(code)
-    to_advance = (text, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes)
+    to_advance = (
+        text,
+        loop,
+        first,
+        length,
+        links,
+        references,
+        air,
+        t,
+        h,
+        n,
+        breaks,
+        own,
+        estimate,
+        work,
+        extremes,
+        typeof(np.zeros(0, np.int64)),
+    )
     to_exchange = (text, loop, first, links, references, air, t, own, estimate, work)
     place = hashlib.sha256(" ".join(m.__file__ for m in (law, observer, plant)).encode()).hexdigest()[:16]
     exchange = from_cache(exchange_kernel, place, to_exchange) if exchanges else exchange_kernel
@@ -376,17 +394,27 @@ def from_cache(kernel: Any, place: str, arguments: tuple[Any, ...]) -> Callable[
 
 def advance(
     parts: Parts, loop: Inner, first: Ints, length: Floats, links: Links, references: References, air: Air, t: float, h: float,
-    n: int, breaks: Floats, own: Floats, estimate: Floats, work: Scratch, extremes: Extremes,
+    n: int, breaks: Floats, own: Floats, estimate: Floats, work: Scratch, extremes: Extremes, shares: Shares = ALONE,
 ) -> Floats:  # fmt: skip
     """Integrate ``own`` and ``estimate`` in place over ``n`` classic Runge-Kutta steps of ``h`` seconds from ``t``.
 
     Steps are split at ``breaks`` (ascending times where the reference or a fault jumps): across a jump the order of the
-    integrator is lost. Returns the forces applied at ``t``, shape (U,).
+    integrator is lost. Returns the forces applied at ``t``, shape (U,). ``shares`` are the trains by threads, and by blocks.
 
     The arguments must be of the types ``compiled`` was given (a float stays a float): nothing is checked here, since numba's own
     check of so many arguments takes 0.4 ms.
     """
-    parts.advance(parts.code, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes)
+    mine, *others = shares.blocks or (np.array([0, len(first) - 1]),)
+    over_it, further = (t, h, n, breaks, own, estimate), []
+    for blocks in others:
+        assert shares.pool is not None
+        space = {name: getattr(loop.law, name).copy() for name in shares.space}
+        apart = loop._replace(law=loop.law._replace(**space)) if space else loop
+        arguments = (apart, first, length, links, references, air, *over_it, work._replace(leader=np.zeros(4)), extremes, blocks)
+        further.append(shares.pool.submit(parts.advance, parts.code, *arguments))
+    parts.advance(parts.code, loop, first, length, links, references, air, *over_it, work, extremes, mine)
+    for one in further:
+        one.result()
     return work.applied_first.copy()
 
 

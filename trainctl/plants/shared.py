@@ -62,6 +62,9 @@ class Constants(NamedTuple):
     installed: Bools  # (n,) by installed force, not by mass
 
 
+#: Fields of the constants that are written into: none.
+WORK: tuple[str, ...] = ()
+
 #: No train.
 NOBODY = Constants(
     np.zeros(1, dtype=np.int64), np.zeros((0, SLOPE + 1)), np.zeros((0, 2)), np.zeros(0), 0.0, 0.0, np.zeros(0, np.bool_)

@@ -24,12 +24,15 @@ The test is a search over edges of ways, and for trains behind each other over p
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from heapq import heappop, heappush
 from types import MappingProxyType
 from typing import NamedTuple
 
+import numpy as np
+
 from trainctl.railway.along import Net
 from trainctl.railway.ways import Ways
-from trainctl.signals import Floats, Ints
+from trainctl.signals import Bools, Floats, Ints
 
 #: Whether train j comes before train i to an edge, at its row m of the one and k of the other: (j, m, i, k).
 Before = Callable[[int, int, int, int], bool]
@@ -75,16 +78,24 @@ def standing(
     """
     on: dict[int, list[tuple[int, int, float]]] = {}
     before: dict[int, list[int]] = {i: [] for i in limits}
+    stood: Bools = np.zeros(len(net.length), bool)  # edges in ``on``
 
-    def stands(i: int, front: float, k: int, room: float) -> None:
-        """Train i stands with its front at ``front``, before the end of row k, or up to ``room`` - its length farther back."""
-        rear = front - room
+    def stands(i: int, front: float, k: int, room: float) -> list[int]:
+        """Train i stands with its front at ``front``, before the end of row k, or up to ``room`` - its length farther back.
+
+        Returns the edges that nobody stood on before.
+        """
+        rear, new = front - room, []
         while k > ways.first[i] and ways.begin[k] >= front:
             k -= 1
         while True:
-            on.setdefault(int(ways.edge[k]), []).append((i, k, rear))
+            e = int(ways.edge[k])
+            if not stood[e]:
+                stood[e] = True
+                new.append(e)
+            on.setdefault(e, []).append((i, k, rear))
             if k == ways.first[i] or ways.begin[k] <= rear:
-                return
+                return new
             k -= 1
 
     at: dict[int, list[int]] = {}
@@ -108,16 +119,32 @@ def standing(
             before[i] += others
             stands(i, float(ways.begin[k]), k, float(length[i]))
     here, known, fresh = Standing(ways, net, row, s - length, on, before, back), set[tuple[int, int]](), True
+    train, rows = _to_pass(ways, row, limits)
+    edges = ways.edge[rows]
     while fresh:
         fresh = False
-        for i, limit in limits.items():
-            for k in range(int(row[i]), limit if limit >= 0 else int(ways.first[i + 1])):
-                for j, m, rear in tuple(on.get(int(ways.edge[k]), ())):
-                    if j != i and (i, j) not in known and i not in before[j] and goes_before(j, m, i, k):
-                        known.add((i, j))
-                        fresh = True
-                        stands(i, float(ways.begin[k] + max(rear - ways.begin[m], 0.0) - clearance), k, float(length[i]))
+        places = np.flatnonzero(stood[edges]).tolist()  # ascending, so it is a heap
+        while places:
+            place = heappop(places)
+            i, k = int(train[place]), int(rows[place])
+            for j, m, rear in tuple(on[int(edges[place])]):
+                if j != i and (i, j) not in known and i not in before[j] and goes_before(j, m, i, k):
+                    known.add((i, j))
+                    fresh = True
+                    new = stands(i, float(ways.begin[k] + max(rear - ways.begin[m], 0.0) - clearance), k, float(length[i]))
+                    for e in new:
+                        for more in np.flatnonzero(edges[place + 1 :] == e).tolist():
+                            heappush(places, place + 1 + more)
     return here
+
+
+def _to_pass(ways: Ways, row: Ints, limits: Mapping[int, int]) -> tuple[Ints, Ints]:
+    """Rows that trains still have to pass up to their ``limits``, train by train as these name them: trains and rows."""
+    trains, limit = np.array(list(limits), np.int64), np.array(list(limits.values()), np.int64)
+    begin, end = row[trains], np.where(limit >= 0, limit, ways.first[trains + 1])
+    count = np.maximum(end - begin, 0)
+    skipped = np.repeat(begin - (np.cumsum(count) - count), count)
+    return np.repeat(trains, count), np.arange(len(skipped)) + skipped
 
 
 def needs(here: Standing, i: int, goes_before: Before) -> Iterable[int]:

@@ -149,14 +149,16 @@ def request(
     order, granted = _queue(trains, state["stretches"], stretches, queues)
     in_place = _in_place(trains, present, np.flatnonzero(outside).tolist(), clearance)
     granted |= {key: False for key in order if outside[key[0]]}  # it has its place in the queue only
+    own = _by_train(stretches), _by_train(joins)
     for i in np.flatnonzero(stands & present).tolist():
-        if _gives_back(trains, present, granted, i, clearance, queues, joins, ordered, back):
+        if _gives_back(trains, present, granted, own[0].get(i, ()), i, clearance, queues, joins, ordered, back):
             until[i] = s[i]
-            for passed, found in ((stretches, granted), (joins, joins)):
-                for key in [key for key, k in passed.items() if key[0] == i and k > row[i]]:
+            for passed, found, keys in ((stretches, granted, own[0]), (joins, joins, own[1])):
+                for key in [key for key in keys.get(i, ()) if passed[key] > row[i]]:
                     found.pop(key, None)
                     passed.pop(key, None)
-            queues = {e: [j for j in queue if (j, e) in joins] for e, queue in queues.items()}
+            if i in own[1]:
+                queues = {e: [j for j in queue if (j, e) in joins] for e, queue in queues.items()}
     order = [key for key in order if key in granted]
     new = granted.keys() - {(i, e) for i, e, _ in state["stretches"]}
     held, waiting, stuck = Index(zones, trains), Index(zones, trains), Index(zones, trains)
@@ -281,11 +283,22 @@ def _until(
     return until
 
 
+def _by_train(requests: Iterable[tuple[int, int]]) -> dict[int, list[tuple[int, int]]]:
+    """Requests, trains with edges, by their trains."""
+    found: dict[int, list[tuple[int, int]]] = {}
+    for key in requests:
+        found.setdefault(key[0], []).append(key)
+    return found
+
+
 def _gives_back(
-    trains: Trains, present: Bools, granted: dict[tuple[int, int], bool], i: int, clearance: float, queues: dict[int, list[int]],
-    joins: dict[tuple[int, int], int], ordered: Sequence[tuple[int, int, int]], back: Mapping[int, Sequence[int]],
+    trains: Trains, present: Bools, granted: dict[tuple[int, int], bool], own: Iterable[tuple[int, int]], i: int, clearance: float,
+    queues: dict[int, list[int]], joins: dict[tuple[int, int], int], ordered: Sequence[tuple[int, int, int]],
+    back: Mapping[int, Sequence[int]],
 ) -> bool:  # fmt: skip
-    """Whether all can still get out if ``i`` does without what lies ahead of it."""
+    """Whether all can still get out if ``i``, whose requests of stretches are its ``own``, does without what lies ahead of it."""
+    if not any(granted.get(key, False) for key in own):
+        return True
     ways = trains.zones.ways
     ahead = {int(e) for e in ways.edge[trains.row[i] + 1 : ways.first[i + 1]]}
     without = {key: g and not (key[0] == i and key[1] in ahead) for key, g in granted.items()}
@@ -335,7 +348,9 @@ def _standing(
     """Where all may come to stand if ``i`` gets the stretches at these rows."""
     zones, begin, edge = trains.zones, trains.zones.ways.begin, trains.zones.ways.edge
     more = {(i, int(edge[k])) for k in rows}
-    limits = {j: _limit(trains, granted, j, more) for j in {i, *np.flatnonzero(on).tolist()}}
+    known = {i, *np.flatnonzero(on).tolist()}
+    following = dict(zip(known, zones.following[trains.row[list(known)]].tolist(), strict=True))
+    limits = {j: k if k < 0 else _limit(trains, granted, j, more) for j, k in following.items()}
     turns = [
         (j, joins[j, e], [m for m in queue[:place] if m in limits and trains.track(m, joins[m, e]) != trains.track(j, joins[j, e])])
         for e, queue in queues.items()

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from trainctl.kernels import keep_by_sources
-from trainctl.signals import Floats, Ints
+from trainctl.signals import Bools, Floats, Ints
 
 keep_by_sources()  # before anything below is decorated
 
@@ -109,6 +109,16 @@ def turned(
         place -= float(length_m[new[k]])
         k += 1
     return there, a + k, place
+
+
+def unchanged(old: Ways, new: Ways) -> Bools:
+    """Trains whose ways lead over the same edges as before, shape (n,)."""
+    same: Bools = np.diff(old.first) == np.diff(new.first)
+    count = np.where(same, np.diff(old.first), 0)
+    train, within = np.repeat(np.arange(len(same)), count), np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    other = old.edge[old.first[train] + within] != new.edge[new.first[train] + within]
+    same[train[other]] = False
+    return same
 
 
 def moved(old: Ways, new: Ways, train: int, place: float) -> float:

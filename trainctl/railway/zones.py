@@ -67,6 +67,33 @@ def short_of_junctions(ways: Ways, net: Net, internal: Bools, row: Ints, s: Floa
     return found
 
 
+def passes_first(
+    pairs: Iterable[tuple[int, int, int]], net: Net, ways: Ways, row: Ints, came: Bools, never: Bools
+) -> list[tuple[int, int, int]]:  # fmt: skip
+    """Trains that must let another one pass an edge first: train, row of the edge in its way, the other one.
+
+    Parameters
+    ----------
+    pairs : iterable of tuple
+        Edge, the train that passes first, and the next one.
+    net, ways : Net, Ways
+        Of all n trains.
+    row : ndarray, shape (n,)
+        Where their fronts are.
+    came, never : ndarray of bool, shape (n,)
+        Trains that have entered, and those that do not pass any more.
+    """
+    found = []
+    for edge, first, then in pairs:
+        here = [edge] if net.twin[edge] < 0 else [edge, net.twin[edge]]
+        rows = [ways.first[i] + np.flatnonzero(np.isin(ways.edge[ways.first[i] : ways.first[i + 1]], here)) for i in (first, then)]
+        if not all(map(len, rows)) or never[first]:
+            continue
+        if not (came[first] and row[first] >= rows[0][0]) and not (came[then] and row[then] >= rows[1][0]):
+            found.append((then, int(rows[1][0]), first))
+    return found
+
+
 class Trains(NamedTuple):
     """Where the trains are."""
 

@@ -40,6 +40,9 @@ from trainctl.signals import (
 from trainctl.topology import convoys, graph
 from trainctl.topology.exchange import Radio
 
+#: Arrays of a roster with one row per train.
+PER_TRAIN = ("depart", "edge", "lane_position", "arrival", "speed", "top_speed", "speed_factor", "cooperates", "driven")
+
 
 @dataclass(frozen=True)
 class Model:
@@ -146,6 +149,14 @@ class Model:
     def leading(self) -> Ints:
         """Rows of the head units in per-unit arrays, shape (n,)."""
         return self.consists.first[:-1]
+
+    def speeds(self, own: Floats) -> Floats:
+        """Speeds of the head units in ``own`` (U, s), contiguous, shape (n,) [m/s]."""
+        return np.ascontiguousarray(own[:, SPEED] if len(own) == len(self.consists.first) - 1 else own[self.leading, SPEED])
+
+    def fronts(self, own: Floats) -> Floats:
+        """Positions of the head units in ``own`` (U, s), shape (n,) [m]; not to be written into."""
+        return own[:, POSITION] if len(own) == len(self.consists.first) - 1 else own[self.leading, POSITION]
 
     @property
     def sampled(self) -> bool:
@@ -256,7 +267,8 @@ class Model:
     @cached_property
     def start_track(self) -> Ints:
         """Track of every train at the start, as index into ``line.track_ids``."""
-        return np.array([self.line.track_ids.index(t.track) for t in self.scenario.train], np.int64)
+        number = {name: k for k, name in enumerate(self.line.track_ids)}
+        return np.array([number[t.track] for t in self.scenario.train], np.int64)
 
     def scene(self, own: Floats, links: Links, time: float) -> Scene:
         """What the law needs to check itself and to prepare its constants."""
@@ -293,6 +305,37 @@ class Model:
         return found
 
     @cached_property
+    def further_edges(self) -> Ints:
+        """Edges that other trains of a longer roster run over."""
+        return np.zeros(0, np.int64)
+
+    def some(self, trains: Ints, further_edges: Ints) -> Model:
+        """The same with these trains (k,) only, ascending, of a roster; what holds of all trains together stays.
+
+        Disturbances, events and other tables that name trains are not followed.
+        """
+        whole = self.supervision, self.driver_rules, self.band, self.net_slope, self.signs  # worked out of all trains
+        assert len(whole)
+        members, roster = trains.tolist(), self.roster
+        units = np.isin(np.repeat(np.arange(len(self.consists.first) - 1), np.diff(self.consists.first)), trains)
+        first = np.concatenate([[0], np.cumsum(np.diff(self.consists.first)[trains])]).astype(np.int64)
+        of_units: list[Any] = [rows[units] if len(rows) else rows for rows in self.consists[1:]]
+        arrays = {name: rows[trains] for name, rows in roster._asdict().items() if name in PER_TRAIN}
+        tuples = {name: tuple(getattr(roster, name)[i] for i in members) for name in ("like", "legs", "stops", "vclass")}
+        scenario = self.scenario.model_copy(update={"train": tuple(self.scenario.train[i] for i in members)})
+        scenario.__dict__.pop("ids", None)
+        found = copy.copy(self)
+        for known in ("first_scene", "sure_braking", "unit"):
+            found.__dict__.pop(known, None)
+        found.__dict__.update(
+            scenario=scenario, consists=Consists(first, *of_units), own=self.own[units], roster=roster._replace(**arrays, **tuples),
+            bounds=Bounds(*(rows[trains] for rows in self.bounds)), clamps=Bounds(*(rows[trains] for rows in self.clamps)),
+            assumed=_rows(self.assumed, trains), relied_on_by_driver=_rows(self.relied_on_by_driver, trains),
+            cruise=self.cruise[trains], start_track=self.start_track[trains], further_edges=further_edges,
+        )  # fmt: skip
+        return found
+
+    @cached_property
     def first_scene(self) -> Scene:
         """The scene at time 0."""
         return self.scene(self.own, self.first_links, 0.0)
@@ -308,6 +351,12 @@ class Model:
         out = np.empty(4)
         leader_at(self.reference, t, t, out)
         return out
+
+
+def _rows(assumed: supervisor.Assumed, trains: Ints) -> supervisor.Assumed:
+    """What is assumed of some trains."""
+    found: dict[str, Any] = {name: part[trains] for name, part in assumed._asdict().items() if isinstance(part, np.ndarray)}
+    return assumed._replace(**found)
 
 
 #: How exactly the band is found [m/s].

@@ -7,7 +7,7 @@ import numpy as np
 from trainctl.railway import authority, supervisor
 from trainctl.railway.authority import View
 from trainctl.scenario.model import Model
-from trainctl.signals import Floats
+from trainctl.signals import Bools, Floats
 
 
 class Room:
@@ -46,3 +46,14 @@ class Room:
         if np.any(ahead.room < self.rules.margin_m) or view.fouling[i] or np.any(view.clear.room[view.clear.other == i] < 0.0):
             return False
         return not self.startles(i, 0.0, speed, view)
+
+
+def meets(view: View, i: int, guests: Bools) -> bool:
+    """Whether what ``view`` says of train ``i`` may be owed to another one of the ``guests`` (n,)."""
+    if view.fouling[i] or (view.ahead.train[i] >= 0 and guests[view.ahead.train[i]]):
+        return True
+    for t in (view.targets, view.clear):
+        met = np.concatenate([t.other[t.train == i], t.train[t.other == i]])
+        if guests[met[met >= 0]].any():
+            return True
+    return False

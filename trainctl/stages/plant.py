@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any, NamedTuple, cast
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from trainctl.contracts import PointPlant, UnitPlant
 from trainctl.davis import resistance
-from trainctl.plants import coupled_units, faults, integrate, point, shared
+from trainctl.plants import coupled_units, faults, integrate, point, shared, threads
 from trainctl.scenario.model import Model
 from trainctl.signals import (
     FORCE,
@@ -151,11 +152,13 @@ class Units:
         self.plant = self.moving.constants(p.plant_params, true, self.gradient, faults=p.scenario.fault, trains=p.scenario.ids)
         self.noise_hold = p.plant.noise_hold(p.plant_params)
         self.noisy = self.noise_hold is not None
+        self.pool: ThreadPoolExecutor | None = None
         self.breaks = np.unique(
             np.concatenate([p.reference.breaks[np.isfinite(p.reference.breaks)], faults.breaks(p.scenario.fault)])
         )
         self.masses = p.consists.train_mass()
         self.lag = p.assumed.lag
+        self.supervised = p.supervision.mode != "off"
         self.hilly = bool(len(self.gradient)) or bool(p.net_slope.any())
         ordered = p.looks_ahead or p.braked
         # Written anew in every step before they are read, like the columns of the plant's table that disturb it.
@@ -209,6 +212,7 @@ class Units:
             work=integrate.scratch(p.own, state.estimate, len(self.masses), p.observer.CORRECTIONS, self.law.MESSAGE),
             heard=np.zeros((len(links.sender), self.law.MESSAGE)), sent_at=0.0, counted=-1,
         )  # fmt: skip
+        self.shares = self._shared(links)
         loop, air = self._loop(constants, now), self._air(now)
         references = References.one(p.reference, len(self.masses))
         self.parts = integrate.compiled(
@@ -218,6 +222,17 @@ class Units:
             exchanges=self.period is not None,
         )  # fmt: skip
         return now
+
+    def _shared(self, links: Links) -> threads.Shares:
+        """The trains by threads; a law that does not say what it writes into may have one only."""
+        own_space: tuple[str, ...] | None = getattr(self.law, "WORK", None)
+        most = 1 if own_space is None else threads.cores()
+        found = threads.shares(self.p.consists.first, links, self.law.MESSAGE > 0 and self.period is None, most)
+        if len(found.blocks) == 1:
+            return found
+        if self.pool is None:
+            self.pool = ThreadPoolExecutor(most - 1, "trains")
+        return found._replace(space=own_space or (), pool=self.pool)
 
     def _loop(self, constants: Any, state: State) -> integrate.Inner:
         return integrate.Inner(self.told if self.p.sampled else constants, state.observer, self.plant, self.orders)
@@ -242,8 +257,8 @@ class Units:
         if len(self.orders.lift):
             self.orders.lift[:] = p.consists.mass * self._climbing(own)
         self._disturb(disturbed)
-        loop, air, links = self._loop(formed.constants, state), self._air(state), formed.links
-        assert links is not None
+        assert formed.links is not None
+        loop, air, links = self._loop(formed.constants, state), self._air(state), formed.links._replace(order=self.shares.order)
         moved = own.copy()
         moved[:, SPEED] += np.repeat(disturbed.speed, np.diff(first))
         began = moved.copy()
@@ -258,7 +273,7 @@ class Units:
             self._make_noise(begin, calm)
             applied = integrate.advance(
                 self.parts, loop, first, p.consists.length, links, formed.references, air, begin, self.h, sub_steps, self.breaks,
-                moved, state.estimate, state.work, state.extremes,
+                moved, state.estimate, state.work, state.extremes, self.shares,
             )  # fmt: skip
             demanded = applied if demanded is None else demanded
         assert demanded is not None
@@ -282,14 +297,18 @@ class Units:
     def _asked(self, began: Floats, moved: Floats, way: Floats, calm: bool) -> Floats:
         """Acceleration that drives every train over the step [m/s2], (n,); NaN where it stops harder than full braking.
 
+        Where no supervisor asks it is the mean.
+
         Where actuators lag it is what they approach; else the mean, or the one that explains the ``way`` (n,) where that is more (a
         law pulls first and brakes later within the step) or less than full braking (it brakes first). ``began`` is the state after
         the disturbance of the speed; what else disturbs, unless the step is ``calm``, is in it.
         """
         leading, full = self.p.leading, self.p.supervision.emergency_mps2
-        hardest: float | Floats = full if calm else full + self.p.assumed.scatter
         v, after = began[leading, SPEED], moved[leading, SPEED]
-        mean = (after - v) / self.step_s
+        mean: Floats = (after - v) / self.step_s
+        if not self.supervised:
+            return mean
+        hardest: float | Floats = full if calm else full + self.p.assumed.scatter
         drives = mean + (self.swing(moved) - self.swing(began)) / self.step_s
         late = self.p.plant.STATES > FORCE
         if late:
@@ -324,7 +343,12 @@ class Units:
         return np.where(own[leading, SPEED] > 0.0, found, np.maximum(found, 0.0))
 
     def swing(self, own: Floats) -> Floats:
-        """By how much couplers, and units against each other, may still speed up every head [m/s], (n,): all of their energy."""
+        """By how much couplers, and units against each other, may still speed up every head [m/s], (n,): all of their energy.
+
+        0 where no supervisor asks.
+        """
+        if not self.supervised:
+            return np.zeros(len(self.masses))
         c, v = self.p.consists, own[:, SPEED]
         units = np.diff(c.first)
         mean = np.add.reduceat(c.mass * v, c.first[:-1]) / self.masses

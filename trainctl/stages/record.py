@@ -10,7 +10,7 @@ import numpy as np
 from trainctl.monitors import bounds as monitor
 from trainctl.record import columns
 from trainctl.record.recorder import ENERGIES, Recorder, standard_tables
-from trainctl.signals import SPEED, Bools, Demand, Disturbed, Extremes, Floats, Formed, Motion, Row, Scene, Seen
+from trainctl.signals import SPEED, Bools, Demand, Disturbed, Extremes, Floats, Formed, Ints, Motion, Row, Scene, Seen
 from trainctl.topology import graph
 
 if TYPE_CHECKING:
@@ -55,7 +55,13 @@ class Journal:
         self.saved = time.monotonic()
         self.train_of_unit = np.repeat(np.arange(len(p.scenario.train)), np.diff(p.consists.first))
         self.unit = p.unit
-        self.train_length = p.consists.train_length()
+        self.lengths = self.train_length = p.consists.train_length()
+        self.trains = np.arange(len(self.lengths))
+
+    def serve(self, trains: Ints | None) -> None:
+        """From now on rows come of these trains (k,), of their numbers in the scenario; None: of all."""
+        self.trains = np.arange(len(self.lengths)) if trains is None else trains
+        self.train_length = self.lengths[self.trains]
 
     def turned(self, p: Model) -> None:
         """Take over a scenario with the units of some trains in another order."""
@@ -72,7 +78,7 @@ class Journal:
         if time.monotonic() - self.saved > SAVE_EVERY_S:
             self.recorder.cut()
             self.saved = time.monotonic()
-        n, here = len(row.ahead), slice(None) if row.seen.present.all() else np.flatnonzero(row.seen.present)
+        trains, n, here = self.trains, len(row.ahead), slice(None) if row.seen.present.all() else np.flatnonzero(row.seen.present)
         now = columns.trains(row, self.train_length)
         numbers: dict[str, Any] = {name: value(now) for name, value in columns.TRAINS.items()}
         if self.has_units:
@@ -85,13 +91,13 @@ class Journal:
             numbers |= dict(zip(self.disturbances, acting, strict=True))
         if self.formed:
             numbers["in_formation"] = row.led.astype(float)
-        numbers |= {"train": np.arange(n), "track": row.track, "edge": row.seen.edge, "saturated": row.saturated}
+        numbers |= {"train": trains, "track": row.track, "edge": row.seen.edge, "saturated": row.saturated}
         if row.seen.present.any():
             self.recorder.write("trains", time_s=row.time, **{name: column[here] for name, column in numbers.items()})
         links = row.links
         if len(links.sender):
             self.recorder.write(
-                "links", time_s=row.time, sender=links.sender, receiver=links.receiver, heard=links.heard,
+                "links", time_s=row.time, sender=trains[links.sender], receiver=trains[links.receiver], heard=links.heard,
                 **{name: value(row) for name, value in columns.LINKS.items()},
             )  # fmt: skip
 
@@ -115,7 +121,9 @@ class Journal:
     def call(self, train: int, call: columns.Call, edge: int) -> None:
         """One row of the stops: a train that has left one, or that comes no more before the end of the run."""
         numbers = {name: value(call) for name, (value, _, _) in columns.STOPS.items()}
-        self.recorder.write("stops", train=[train], stop=self.stops.index(call.stop.name), platform=edge, **numbers)
+        self.recorder.write(
+            "stops", train=[int(self.trains[train])], stop=self.stops.index(call.stop.name), platform=edge, **numbers
+        )
 
     def join(self) -> None:
         """Complete the tables; the segments they are made from stay."""
@@ -143,7 +151,8 @@ class Record:
     def __init__(self, p: Model, journal: Journal) -> None:
         self.p, self.journal = p, journal
         self.alarms = monitor.Alarms(p)
-        self.track_of = np.array([p.line.track_ids.index(t) for t in p.line.tracks], np.int64)
+        number = {name: k for k, name in enumerate(p.line.track_ids)}
+        self.track_of = np.array([number[t] for t in p.line.tracks], np.int64)
 
     def initial(self) -> State:
         """Nothing seen."""

@@ -56,7 +56,7 @@ class Signals:
     def step(
         self, t: float, ways: Ways, seen: Seen, speed: Floats, traffic: Traffic, box: SignalBox | None, s: State
     ) -> tuple[State, Held | None]:  # fmt: skip
-        """How far every train may go before a signal; None where nobody obeys them.
+        """How far every train may go before a signal; None where they are not obeyed.
 
         Parameters
         ----------

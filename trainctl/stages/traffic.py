@@ -12,17 +12,16 @@ from trainctl.monitors import waiting
 from trainctl.railway import along, aspects, authority, interlocking, signs, supervisor, zones
 from trainctl.railway.authority import DRIVER_MARGIN_M, View
 from trainctl.railway.interlocking import Held
-from trainctl.railway.ways import Ways, moved
+from trainctl.railway.ways import Ways, moved, unchanged
 from trainctl.record.columns import Call
 from trainctl.scenario.model import Model
 from trainctl.scenario.roster import Stop
 from trainctl.signals import Bools, Floats, Ints, Seen
-from trainctl.stages.places import Room
+from trainctl.stages import calls
+from trainctl.stages.calls import STANDS_MPS, STOP_BAND_M
+from trainctl.stages.places import Room, meets
 from trainctl.stages.record import Journal
 from trainctl.stages.turns import Turn, Turns, stopping
-
-#: A train that is slower and nearer to its stop than this has reached it [m/s], [m].
-STANDS_MPS, STOP_BAND_M = 0.05, 2.0
 
 #: A train that passes a place just before it turns has done so this far before where it may turn last [m].
 PASSED_M = 0.5
@@ -76,14 +75,14 @@ class Around(NamedTuple):
     entries: tuple[tuple[int, float], ...]  # trains that come with the coming step, with their speeds [m/s]
     stops: tuple[Ints, Floats]  # trains with a stop ahead, and the room to it [m]
     soon: Bools  # (n,) they stop soon
-    held: Held | None  # how far each may go before a place that is another's; None: nobody asks
+    held: Held | None  # how far each may go before a place that another has; None: not needed
     kept_out: dict[int, int]  # trains that are due and cannot enter: because of whom
-    view: View | None  # None: nobody asks
+    view: View | None  # None: not needed
     turns: tuple[Turn, ...] = ()  # trains that turn with the coming step
 
 
 def nothing(trains: int) -> Around:
-    """Nobody comes, stops, waits or looks ahead."""
+    """No train comes, stops, waits or looks ahead."""
     return Around((), (np.zeros(0, np.int64), np.zeros(0)), np.zeros(trains, bool), None, {}, None)
 
 
@@ -101,7 +100,6 @@ class Traffic:
         self.step_s, self.theta = p.scenario.run.step_s, p.step_theta
         self.room = Room(p)
         self.net, self.length = along.net(p.rails), p.consists.train_length()
-        self.stops_of = np.array([len(stops) for stops in p.roster.stops], np.int64)
         self.looks, self.join_range_m = p.looks_ahead, p.driving.join_range_m if p.driven else 0.0
         planned = min(
             p.supervision.emergency_mps2, p.supervision.service_mps2, *([p.driving.deceleration_mps2] if p.driven else [])
@@ -116,6 +114,7 @@ class Traffic:
         self.ways: Ways | None = None
         self._limits(0.0)
         self.turns, self.stopping, self.stops = Turns(p, self.net, journal), stopping(p), list(p.roster.stops)
+        self.calls = calls.calls(self.stops)
 
     def initial(self) -> State:
         """Before the run: trains that are placed have come."""
@@ -135,7 +134,7 @@ class Traffic:
         """Arrivals, stops, entries; ``overrun`` (n,) is how much farther trains run than their brakes promise [m].
 
         Who is due at the end of the coming step is let in now, and is there then: in time. ``speed`` (n,) gets the speeds of trains
-        that enter; at the ``last`` instant of a run nobody does. ``red`` is how far signals let everybody go, where they decide.
+        that enter; at the ``last`` instant of a run none does. ``red`` is how far signals let each train go, where they decide.
         """
         s = self.departures(t, seen, speed, self.arrivals(t, seen, s))
         if not self.looks:
@@ -169,12 +168,15 @@ class Traffic:
         self.ways, self.zones = ways, zones.of(ways, self.net, self.turns.later)
         if self.turns.any:
             self.turns.changed(ways, s.leg)
-        if self.stops_of.any():
+        if self.calls.number.any():
             begun = self.turns.begun(s.leg)
-            self.stops = [
-                tuple(one._replace(place=moved(begun, ways, i, one.place)) if one.leg == s.leg[i] else one for one in stops)
-                for i, stops in enumerate(self.roster.stops)
-            ]
+            self.stops = list(self.roster.stops)
+            for i in np.flatnonzero(~unchanged(begun, ways)).tolist():
+                self.stops[i] = tuple(
+                    one._replace(place=moved(begun, ways, i, one.place)) if one.leg == s.leg[i] else one
+                    for one in self.roster.stops[i]
+                )
+            self.calls = calls.calls(self.stops)
 
     # Arrivals and entries
 
@@ -201,9 +203,9 @@ class Traffic:
 
     def kept_parked(self, trains: Sequence[int], s: State) -> State:
         """Trains that SUMO has not let back from where they are parked: they are to ask again."""
-        s = s._replace(parked=s.parked.copy())
-        s.parked[trains] = True
-        return s
+        parked = s.parked.copy()
+        parked[trains] = True
+        return s._replace(parked=parked)
 
     def due(self, t: float, s: State) -> list[int]:
         """Trains that are to come at ``t``: of each edge the first that waits there."""
@@ -221,8 +223,7 @@ class Traffic:
 
     def missing(self, t: float, s: State) -> list[str]:
         """Trains that were due and never came."""
-        late = np.flatnonzero(~s.came & (self.roster.depart <= t + 1e-9)).tolist()
-        return [self.p.scenario.ids[i] for i in late]
+        return [self.p.scenario.ids[i] for i in np.flatnonzero(~s.came & (self.roster.depart <= t + 1e-9)).tolist()]
 
     def entering(
         self, t: float, ways: Ways, here: Seen, speed: Floats, s: State, due: Sequence[int], reach: Floats | None = None,
@@ -243,24 +244,32 @@ class Traffic:
             s, held = self._request(t, ways, here, reach, asking, asking & ~stands, s)
             self._let_in(t, ways, here, speed, due, np.where(np.isin(before, due), 0.0, reach), held, s)
         s = s._replace(parked=s.parked.copy())
-        present, came, entering = here.present.copy(), s.came.copy(), s.entering.copy()
+        present, came, entering, reach = here.present.copy(), s.came.copy(), s.entering.copy(), self._reach(speed)
         come: list[tuple[int, float]] = []
         kept_out: dict[int, int] = {}
+        asking[[i for i in due if held.room[i] <= 0.0]] = False
+        together: View | None = None  # with all who ask at their places
         for i in due:
             if held.room[i] <= 0.0:
                 continue
-            present[i] = True
-            view = self._look(ways, here._replace(present=present), speed, held, s, self._reach(speed))
+            if together is None:
+                guests = asking.copy()
+                together = self._look(ways, here._replace(present=present | guests), speed, held, s, reach)
+            present[i], asking[i], view = True, False, together
+            if meets(together, i, guests):  # to each of them only those are there that have come
+                view = self._look(ways, here._replace(present=present), speed, held, s, reach)
             if s.parked[i]:
                 present[i] = self.room.returns(i, speed, view)
                 s.parked[i] = not present[i]  # and stands for one more step, the one in which it comes back
+                together = None if present[i] else together
                 continue
             v = self._entering_speed(i, ways, here, speed, view, held, s, after)
             present[i] = v is not None
             if v is None:
                 kept_out[i] = waiting.kept_out(view, i)
                 continue
-            came[i], entering[i], speed[i] = True, True, v
+            came[i], entering[i], speed[i], together = True, True, v, None
+            reach = self._reach(speed)
             come.append((i, v))
         keeping = np.full(len(speed), -1)
         keeping[list(kept_out)] = list(kept_out.values())
@@ -342,20 +351,23 @@ class Traffic:
         return min(stop.place, last) - (stop.waits_before if self._full(stop, s) else 0.0)
 
     def _further(self, stop: Stop, i: int) -> float:
-        """How far behind a stop a train would come to a stand that passes it as fast as it may [m]; 0 if it is to stand there."""
-        return float(self.stopping(np.array([i]), np.array([stop.passing]))[0])
+        """How far beyond a stop a train comes to a standstill that passes it as fast as it may [m]; 0 if it is to stop there."""
+        return float(self.stopping(np.array([i]), np.array([stop.passing]))[0]) if stop.passing else 0.0
 
     def _stops(self, t: float, seen: Seen, speed: Floats, overrun: Floats, s: State) -> tuple[State, tuple[Ints, Floats], Bools]:
         """Arrive at and leave stops; the trains that have one ahead and the room to it [m], and who stops soon."""
-        trains, rooms, n = [], [], len(speed)
-        if not (self.stops_of.any() or self.turns.any):
+        trains, rooms, n = list[int](), list[float](), len(speed)
+        if not (self.calls.number.any() or self.turns.any):
             return s, nothing(n).stops, np.zeros(n, bool)
         standing = ~np.isnan(s.stands_until)
         s = s._replace(
             next_stop=s.next_stop.copy(), stands_since=s.stands_since.copy(), stands_until=s.stands_until.copy(),
             late=s.late.copy(), stopping=s.stopping.copy(), parked=s.parked.copy(),
         )  # fmt: skip
-        for i in np.flatnonzero(seen.present & (s.next_stop < self.stops_of)).tolist():
+        asked = np.flatnonzero(seen.present & (s.next_stop < self.calls.number))
+        plain, ahead = calls.on_the_way(self.calls, asked, s.next_stop, s.leg, seen.position, speed, standing)
+        plain &= ~np.isin(asked, list(self.turns.yards))  # who is to turn may have to stand before its stop
+        for i in asked[~plain].tolist():
             stop = self.stop_of(i, s)
             while stop is not None and np.isnan(stop.place):
                 self.journal.event(t, "stop_dropped", train=self.p.scenario.ids[i], stop=stop.name)
@@ -398,13 +410,14 @@ class Traffic:
             beyond = self.turns.last_place(i) - float(seen.position[i]) - float(overrun[i])
             trains.append(i)
             rooms.append(min(max(room - float(overrun[i]), 0.0) + self._further(stop, i), max(beyond, 0.0)))
+        trains, rooms = calls.merged(trains, rooms, asked[plain], np.maximum(ahead[plain] - overrun[asked[plain]], 0.0))
         if self.turns.yards:
             free = np.array([self.stop_of(i, s) is None for i in range(n)])
-            stand, ahead = self.turns.wanted(seen, speed, free, ~np.isnan(s.turns_since), self.stopping, STANDS_MPS)
+            stand, further = self.turns.wanted(seen, speed, free, ~np.isnan(s.turns_since), self.stopping, STANDS_MPS)
             s = s._replace(turns_since=s.turns_since.copy())
             s.turns_since[[i for i in stand if np.isnan(s.turns_since[i])]] = t
-            trains += [i for i, _ in ahead]
-            rooms += [max(room - float(overrun[i]), 0.0) for i, room in ahead]
+            trains += [i for i, _ in further]
+            rooms += [max(room - float(overrun[i]), 0.0) for i, room in further]
         found, room_to = np.array(trains, np.int64), np.array(rooms)
         braking = self.stopping(found, speed[found])
         near, soon = np.zeros(n, bool), np.zeros(n, bool)
@@ -445,35 +458,18 @@ class Traffic:
         braking = supervisor.stopping_distance(v, self.requesting, self.step_s, self.theta)
         return braking + 4.0 * v * self.step_s + rules.margin_m + 2.0 * DRIVER_MARGIN_M + 50.0 + 6.0 * assumed.uncertainty
 
-    def _own_stops(self, s: State) -> Floats:
-        """Where every train is to stand next [m], shape (n,); inf: nowhere."""
-        places = np.full(len(self.length), np.inf)
-        for i in np.flatnonzero(s.came & ~s.left & (s.next_stop < self.stops_of)).tolist():
-            stop = self.stop_of(i, s)
-            places[i] = np.inf if stop is None or stop.passing else stop.place
-        return places
-
     def _ordered(self, t: float, ways: Ways, seen: Seen, s: State) -> list[tuple[int, int, int]]:
-        """Trains that must let another one pass an edge first: train, row of the edge in its way, the other one."""
-        found = []
-        for edge, first, then in self.pairs:
-            here = [edge] if self.net.twin[edge] < 0 else [edge, self.net.twin[edge]]
-            rows = [
-                ways.first[i] + np.flatnonzero(np.isin(ways.edge[ways.first[i] : ways.first[i + 1]], here)) for i in (first, then)
-            ]
-            if not all(map(len, rows)) or s.left[first] or (not s.came[first] and self._given_up(t)[first]):
-                continue
-            if not (s.came[first] and seen.row[first] >= rows[0][0]) and not (s.came[then] and seen.row[then] >= rows[1][0]):
-                found.append((then, int(rows[1][0]), first))
-        return found
+        """Trains that must let another one pass an edge first, see ``zones.passes_first``."""
+        return zones.passes_first(self.pairs, self.net, ways, seen.row, s.came, s.left | ~s.came & self._given_up(t))
 
     def _request(
         self, t: float, ways: Ways, seen: Seen, reach: Floats, entering: Bools, keeps: Bools, s: State
     ) -> tuple[State, Held]:
         """Let every train request what lies within its reach; ``entering`` (n,) are those that ask to enter the net."""
+        stops = calls.own_stops(self.calls, s.came & ~s.left, s.next_stop, s.leg)
         requests, held, said = interlocking.request(
             self.zones, s.requests, seen.row, seen.position, self.length, seen.present, reach,
-            self.p.supervision.margin_m + DRIVER_MARGIN_M, entering, self._own_stops(s), s.standing,
+            self.p.supervision.margin_m + DRIVER_MARGIN_M, entering, stops, s.standing,
             self._ordered(t, ways, seen, s), keeps, self.turns.back(s.leg),
         )  # fmt: skip
         ids, edges = self.p.scenario.ids, self.p.rails.edges

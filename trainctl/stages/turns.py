@@ -57,7 +57,7 @@ class Turns:
         self.legs = [[np.array([index[e] for e in leg], np.int64) for leg in legs] for legs in p.roster.legs]
         self.last_leg = np.array([len(legs) - 1 for legs in self.legs], np.int64)
         self.any = bool(self.last_leg.any())
-        self.later = np.unique(np.concatenate([np.zeros(0, np.int64), *(leg for legs in self.legs for leg in legs[1:])]))
+        self.later = np.unique(np.concatenate([p.further_edges, *(leg for legs in self.legs for leg in legs[1:])]))
         self.yards: dict[int, Yard] = {}
 
     def begun(self, leg: Ints) -> Ways:

@@ -50,6 +50,12 @@ OPTIONS_OF_NO_EFFECT = _words(
     "load-state.offset load-state.remove-vehicles",
 )
 
+#: How the names of other such options begin: of devices that watch trains, and of what is no train.
+OF_NO_EFFECT_FROM = (
+    "gui", "emissions.", "pedestrian.", "person-device.", "persontrip.",
+    *(f"device.{name}." for name in ("fcd", "emissions", "ssm", "tripinfo", "vehroute")),
+)  # fmt: skip
+
 #: Options that are not followed: in which words, and the values with which they mean nothing.
 OPTIONS_NAMED: Mapping[str, tuple[str, frozenset[str]]] = {
     "step-length": ("the step is run.step_s of the scenario", frozenset()),
@@ -71,8 +77,6 @@ OPTIONS_NAMED: Mapping[str, tuple[str, frozenset[str]]] = {
     "default.carfollowmodel": ("the scenario's law drives the trains", frozenset()),
     "default.emergencydecel": ("the scenario's supervisor brakes the trains", frozenset()),
     "use-stop-started": ("a stop begins when the train stands", OFF),
-    "device.rerouting.probability": ("trains keep their routes", OFF),
-    "device.rerouting.explicit": ("trains keep their routes", OFF),
     "ignore-route-errors": ("routes must be connected", OFF),
     "max-num-vehicles": ("all trains come", OFF),
     "insertion-checks": ("a train enters when it can do so safely", frozenset()),
@@ -211,13 +215,18 @@ NET_CONNECTION = _words(
 )
 
 
+#: The same of options whose names begin so.
+OPTIONS_NAMED_FROM = {"device.rerouting.": ("trains keep their routes", OFF)}
+
+
 def of_options(options: Mapping[str, str]) -> list[str]:
     """What options of a configuration are not followed, one line each."""
     lines = []
     for key, value in options.items():
-        if key in OPTIONS or key in OPTIONS_OF_NO_EFFECT or "output" in key or key.startswith(("gui", "emissions.", "pedestrian.")):
+        if key in OPTIONS or key in OPTIONS_OF_NO_EFFECT or "output" in key or key.startswith(OF_NO_EFFECT_FROM):
             continue
-        words, idle = OPTIONS_NAMED.get(key, (UNKNOWN, frozenset()))
+        kind = next((said for start, said in OPTIONS_NAMED_FROM.items() if key.startswith(start)), (UNKNOWN, frozenset[str]()))
+        words, idle = OPTIONS_NAMED.get(key, kind)
         if value not in idle:
             lines.append(f"option {key} = {value}: not followed: {words}")
     return lines

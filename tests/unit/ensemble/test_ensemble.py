@@ -138,7 +138,7 @@ def test_a_run_does_not_depend_on_those_beside_it():
         (
             "fully_distributed",
             {"event": [{"kind": "reroute", "train": 2, "crossover": "leave", "time_s": 9.0}]},
-            "events on the way",
+            "events during the run",
         ),
         ("fault_tolerant_noise", {}, "noise"),
         ("merging", {}, "come and go"),

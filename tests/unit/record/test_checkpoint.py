@@ -135,7 +135,7 @@ OUTSIDE = {"p", "built", "world", "journal", "between"}
 
 #: What a stage may overwrite: written anew in every step before it is read, or made of the world's ways.
 WORK_SPACE = {
-    "plant": {"parts", "told", "orders", "plant", "constants"},
+    "plant": {"parts", "told", "orders", "plant", "constants", "shares", "pool"},
     "traffic": {"ways", "zones"},
 }  # fmt: skip
 

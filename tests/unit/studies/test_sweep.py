@@ -276,7 +276,7 @@ def test_runs_that_cannot_go_side_by_side_run_one_by_one_and_it_is_said(here, tm
     assert info["complete"] == 12 - info["refused"]
     late = [{"kind": "reroute", "train": 2, "crossover": "leave", "time_s": 9.0}]
     ordered = SweepPlan("fully_distributed", {**SHORT, "event": [late]}, range(10), {}, "numeric")
-    assert sweep(ordered, tmp_path / "ordered")["alone"] == {"it has events on the way": 10}
+    assert sweep(ordered, tmp_path / "ordered")["alone"] == {"it has events during the run": 10}
     assert sweep(MANY, tmp_path / "kept", keep=True)["alone"] == {"--keep asks for its tables": 26}
 
 

@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 import tomllib
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -142,3 +143,42 @@ def test_runs_side_by_side_are_as_many_train_steps_as_it_says(monkeypatch):
     assert ensembles.together(found) == ensembles.plain(3) == 3 * 6 * 40
     rows = [{"case": "plain", "runs": 3, "million_per_s": 2.0, "us_per_train_step": 0.5, "to_plain": 1.0}, {"to_one": 1.8}]
     assert ensembles.table(rows).splitlines()[-1] == "two processes at once do 1.8 times what one does"
+
+
+def test_agents_are_measured_beside_the_loop():
+    command = [sys.executable, FILE, "--environment", "3", "--repeats", "1", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    rows = {row["case"]: row for row in json.loads(done.stdout)}
+    assert list(rows) == ["vector", "vector_random", "parallel", "reset", "loop", "sumo_vector", "sumo_parallel"]
+    assert rows["loop"]["to_loop"] == 1.0 and rows["sumo_vector"]["to_loop"] > 0.0
+    assert rows["vector"]["million_per_s"] > rows["sumo_vector"]["million_per_s"] > 0.0
+
+
+def test_the_country_s_timetable_has_the_trains_it_says_and_all_ways_are_on_its_net(monkeypatch):
+    monkeypatch.syspath_prepend(str(FILE.parent))
+    country = importlib.import_module("country")
+    net = country.plan(country.CORRIDORS)
+    rows = country.timetable(net, country.CORRIDORS, country.RUNS, country.DAY_S)
+    assert len(rows) == 36_000 and all(a[0] <= b[0] < country.DAY_S for a, b in pairwise(rows))
+    edges = {edge for ways in country.routes(country.CORRIDORS).values() for way in ways for edge in way}
+    assert edges <= net.length.keys() and sum(edge[0] in "EW" and edge[1] != "L" for edge in edges) == 880  # stations
+    assert any(f"-{edge}" in edges for edge in edges)  # single track
+
+
+def test_every_train_of_a_small_country_is_accounted_for_and_some_wait_to_enter(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(FILE.parent))
+    country, day = (importlib.import_module(name) for name in ("country", "bench_country"))
+    country.write(tmp_path, runs=600, corridors=2, day_s=6000.0, first=60, duration_s=3000.0)
+    row = day.whole(tmp_path)
+    assert row["roster"] == 60 == row["entered"] + row["not_entered"]
+    assert row["entered"] == row["arrived"] + row["on_the_way"]
+    assert row["arrived"] > 0 and row["stops"] > 100
+    assert row["waited_to_enter"] > 0 and row["longest_wait_s"] > 10.0
+    assert (row["collisions"], row["gridlocks"]) == (0, 0)
+
+
+def test_kernels_are_measured_on_six_formations():
+    text, line = bench.scenario("finite_time", 12, 10, tracks=6)
+    assert [t["track"] for t in tomllib.loads(text)["train"]] == [k for k in range(1, 7) for _ in range(2)]
+    assert tomllib.loads(line)["tracks"] == [2, 1, 3, 4, 5, 6]

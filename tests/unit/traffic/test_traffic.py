@@ -319,7 +319,8 @@ def test_what_nobody_thought_of_is_named(files: Files) -> None:
         '<riddle id="r"/><riddle id="s"/>'
     )
     said = files.sumocfg.read_text().replace(
-        "<time>", '<strange value="7"/><fcd-output value="f.xml"/><verbose value="true"/><time>'
+        "<time>",
+        '<strange value="7"/><device.rerouting.period value="10"/><device.fcd.period value="3"/><fcd-output value="f.xml"/><verbose value="true"/><time>',
     )
     files.sumocfg.write_text(said)
     net = files.folder / "n.net.xml"
@@ -333,6 +334,7 @@ def test_what_nobody_thought_of_is_named(files: Files) -> None:
         f"net: 1 x <edge colour>: {unknown}",
         f"net: 1 x <oddity>: {unknown}",
     ]
+    assert "option device.rerouting.period = 10: not followed: trains keep their routes" in notes
     assert not [n for n in notes if "fcd" in n or "verbose" in n or "color" in n]
 
 
