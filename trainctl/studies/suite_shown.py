@@ -68,7 +68,8 @@ def _text(name: str) -> str:
 def _cell(cell: Mapping[str, Any]) -> str:
     if cell["what"] == REFUSED or cell["gap_m"] is None:
         return f"<td class='refused'>{words(cell)}</td>"
-    why = f"touched {cell['contacts']}, too fast by {max(cell['faster_mps'], 0.0):.2g} m/s<br>" if cell["failed"] else ""
+    fast = max(cell["faster_mps"], 0.0)
+    why = f"touched {cell['contacts']}<br>{fast:.2g} m/s too fast<br>" if cell["failed"] else ""
     more = f"{why}gap {cell['gap_m']:.0f} m<br>error {cell['error_m']:.0f} m<br>jerk {cell['jerk_rms_mps3']:.2g} m/s³"
     return f"<td class='{'bad' if cell['failed'] else 'good'}'>{words(cell)}<small>{more}</small></td>"
 
