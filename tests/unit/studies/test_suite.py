@@ -92,7 +92,7 @@ CELLS = [
 def test_the_page_has_a_cell_for_each_pair_and_says_why(tmp_path) -> None:
     page = suite_shown.page(CELLS, SuitePlan())
     assert page.count("<td") == 4 and "class='bad'>3 of 20 (5.2 .. 36 %)" in page and "class='good'>0 of 20 (0 .. 16 %)" in page
-    assert "touched 1, too fast by 0.034 m/s" in page and page.count("touched 0") == 0
+    assert "touched 1<br>0.034 m/s too fast" in page and page.count("touched 0") == 0
     assert "one run of each of 2 cells as well: minimum gaps differ by at most 0.25 m" in page
     assert "a &lt; b &amp; c" in page and "no longer finite" in page and "src=" not in page
     assert suite_shown.write_page(CELLS, SuitePlan(), tmp_path).read_text() == page
