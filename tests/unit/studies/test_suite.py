@@ -46,6 +46,13 @@ def test_masses_that_nobody_knows_make_a_difference(tmp_path) -> None:
     assert set(errors.values()) == {-5.0, 5.0} and len(errors) == 12
 
 
+def test_without_sumo_cells_are_run_all_the_same(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(suite, "has_sumo", lambda: False)
+    found = cell(PLAN, "relative_braking", "calm", tmp_path)
+    assert found.what == "run" and found.sumo_failed is None
+    assert suite_shown.confirmed([found.plain()]) == "No cell was run in SUMO."
+
+
 def test_sumo_moves_the_first_run_of_a_cell_as_it_is_moved_without(tmp_path) -> None:
     found = cell(PLAN, "relative_braking", "leave", tmp_path)
     assert found.sumo_failed is False and found.sumo_gap_m == pytest.approx(found.first_gap_m, abs=1e-6)
