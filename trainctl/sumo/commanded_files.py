@@ -15,7 +15,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from trainctl.signals import Start
+from trainctl.signals import Floats, Start
 from trainctl.sumo.signal_box import NOT_WITH_SIGNALS, Obeyed, write
 
 OPTIONS = {
@@ -51,11 +51,12 @@ HELD_S = 1e6
 _IDLE = 'accel="100" decel="100"'
 
 
-def write_routes(start: Start, path: Path, obeyed: Obeyed | None = None) -> list[str]:
+def write_routes(start: Start, path: Path, obeyed: Obeyed | None = None, limit: Floats | None = None) -> list[str]:
     """The trains as SUMO vehicles: true lengths and carriages, no randomness, no limits of SUMO's own.
 
     Those that come later have their types here and are added when they come. Returns the type of every train. Where signals are
-    ``obeyed`` a type brakes as its trains do, and SUMO lets no train in before the block is free.
+    ``obeyed`` a type brakes as its trains do, and SUMO lets no train in before the block is free. ``limit`` (n,) is that of the net
+    where each train starts [m/s]: SUMO refuses one that is faster, as a sign may allow, but for a speed factor.
     """
     types: dict[tuple[str, tuple[float, ...], str], str] = {}
     taken = set() if obeyed is None else set(re.findall(r'<vType [^>]*id="([^"]*)"', "".join(obeyed.handed.types)))
@@ -72,8 +73,9 @@ def write_routes(start: Start, path: Path, obeyed: Obeyed | None = None) -> list
             continue
         route = " ".join(normal(start.routes[i] if obeyed is None else obeyed.way(i)))
         arrival = arrival_word(np.inf if start.arrival is None else float(start.arrival[i]))
+        fast = "" if limit is None or start.speed[i] <= limit[i] else f' speedFactor="{float(start.speed[i] / limit[i]) + 1e-6!r}"'
         rows.append(
-            f'    <vehicle id={quoteattr(name)} type="{kind}" depart="{begin}" departLane="best"{checks}'
+            f'    <vehicle id={quoteattr(name)} type="{kind}" depart="{begin}" departLane="best"{checks}{fast}'
             f' departPos="{float(start.lane_position[i])!r}" departSpeed="{float(start.speed[i])!r}" arrivalPos="{arrival}">\n'
             f'        <route edges="{route}"/>{_hold(obeyed, i)}{_trip(obeyed, i)}\n    </vehicle>\n'
         )

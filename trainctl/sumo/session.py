@@ -164,7 +164,7 @@ class Sumo(Session):
         wrong = objections(self.line, self.time_step)
         if wrong:
             raise SimulatorError("; ".join(wrong))
-        self.kinds = write_routes(start, self.folder / "trains.rou.xml", self.obeyed)
+        self.kinds = write_routes(start, self.folder / "trains.rou.xml", self.obeyed, self.line.speed_mps[start.edge])
         end = (self.steps + 1) * self.time_step
         configuration = write_configuration(
             self.folder, self.net.name, "trains.rou.xml", self.time_step, end, self.internal, self.record_every, self.obeyed
