@@ -27,13 +27,14 @@ lint: $(READY)
 docs: $(READY)
 	$(BIN)/python tools/site.py
 
-# The last line compiles the kernels once, so that the first run does not wait for them.
+# The last lines compile the kernels once, so that no first run waits for them: the default scenario's, then all others on all cores.
 $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "trainctl needs Python 3.11 or later")'
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps --editable .
 	$(BIN)/trainctl run three_tracks --backend numeric --set run.duration_s=8 --out .venv/first-run --quiet
+	$(BIN)/python tools/compile_kernels.py
 	@touch $(READY)
 
 clean:

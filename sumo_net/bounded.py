@@ -55,3 +55,8 @@ def short_text(path: Path) -> str:
     if len(found) > MOST_TEXT:
         raise TooLong(f"longer than {MOST_TEXT >> 20} MiB")
     return found.decode()
+
+
+def reason(error: Exception) -> str:
+    """Why a text cannot be read, in words."""
+    return "nested too deeply" if isinstance(error, RecursionError) else str(error)

@@ -15,6 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from sumo_net.bounded import TooLong, reason, short_text
 from sumo_net.spec import LineError, LineSpec, parse_spec, rounded, text
 
 #: Factors to SI of the units the two formats use, per kind of quantity.
@@ -170,24 +171,26 @@ def convert(path: str | Path, options: Options) -> Imported:
 
 def _load(path: Path) -> Place:
     try:
-        content = path.read_text(encoding="utf-8")
+        content = short_text(path)
     except FileNotFoundError:
         raise LineError([f"{path}: no such file"]) from None
     except OSError as error:
         raise LineError([f"{path}: cannot be read: {error.strerror}"]) from None
+    except TooLong as error:
+        raise LineError([f"{path}: neither format: {error}"]) from None
     except UnicodeDecodeError as error:
         raise LineError([f"{path}: neither format: not text: {error}"]) from None
     if content.lstrip().startswith("{"):
         try:
             return Place(json.loads(content), path.name)
         except (ValueError, RecursionError) as error:
-            raise LineError([f"{path}: not JSON: {error}"]) from None
+            raise LineError([f"{path}: not JSON: {reason(error)}"]) from None
     import yaml
 
     try:
         data = yaml.safe_load(content)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        problem = " ".join(str(error).split())[:200]
+        problem = " ".join(reason(error).split())[:200]
         raise LineError([f"{path}: neither JSON nor YAML: {problem}"]) from None
     if not isinstance(data, dict):
         raise LineError([f"{path}: neither format: known are {KNOWN}"])

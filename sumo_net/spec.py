@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from sumo_net.bounded import short_text
+from sumo_net.bounded import reason, short_text
 
 #: Distance between the centres of neighbouring tracks [m].
 TRACK_SPACING_M = 4.5
@@ -211,7 +211,7 @@ def read_spec(path: str | Path) -> LineSpec:
     except OSError as error:
         raise LineError([f"{path}: cannot be read: {error.strerror}"]) from None
     except (ValueError, RecursionError) as error:  # not TOML, not text, a number of 5000 digits
-        raise LineError([f"{path}: not TOML: {error}"]) from None
+        raise LineError([f"{path}: not TOML: {reason(error)}"]) from None
     return parse_spec(data, str(path))
 
 

@@ -741,6 +741,7 @@ def main() -> None:
     parser.add_argument("--instructions", action="store_true", help="count instructions with valgrind: repeatable, but slow")
     parser.add_argument("--logs", type=float, nargs="?", const=40.0, metavar="MB", help="how fast logs of this size are read")
     parser.add_argument("--ensembles", type=int, nargs="?", const=1000, metavar="RUNS", help="how fast runs side by side are")
+    parser.add_argument("--environment", type=int, nargs="?", const=1000, metavar="RUNS", help="how fast agents step")
     parser.add_argument(
         "--country", type=float, nargs="?", const=1.0, metavar="HOURS", help="a day of a country, so many hours of it"
     )
@@ -789,6 +790,11 @@ def main() -> None:
 
         rows = bench_ensembles.ensembles(asked.ensembles, asked.repeats or 3)
         print(json.dumps(rows, indent=2) if asked.json else bench_ensembles.table(rows))
+    elif asked.environment is not None:
+        import bench_environment
+
+        rows = bench_environment.environment(asked.environment, asked.repeats or 5)
+        print(json.dumps(rows, indent=2) if asked.json else bench_environment.table(rows))
     elif asked.logs is not None:
         import bench_logs
 

@@ -121,7 +121,7 @@ class Loop(Steps):
             world.claim(shown.aspects.claims)
 
         # traffic: departures, stops -> entries; whose turn it is; what is ahead of every train, where it is needed
-        late = self.plant.overrun(own, p.driver_rules.service_mps2)
+        late = self.plant.overrun(own, p.driver_braking)
         going, around = self.traffic.step(t, ways, here, speed, late, s.traffic, red=red)
         for i, v in around.entries:
             own[p.consists.first[i] : p.consists.first[i + 1], SPEED] = v
@@ -191,7 +191,7 @@ class Loop(Steps):
         """The last instant, from which no train moves on: no orders, no entries; else sorted, watched and recorded as any other."""
         s, world, t = self.state, self.world, self.time
         own, here, ways = self.measured(s), world.measure(), world.ways
-        late = self.plant.overrun(own, self.p.driver_rules.service_mps2)
+        late = self.plant.overrun(own, self.p.driver_braking)
         speed = own[self.p.leading, SPEED].copy()
         _, red = self.signals.step(t, ways, here, speed, s.traffic, world.box, s.signals)
         going, around = self.traffic.step(t, ways, here, speed, late, s.traffic, last=True, red=red)

@@ -10,6 +10,7 @@ import threading
 import time
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -430,10 +431,12 @@ def open_world(p: Model, folder: Path, backend: Backend, gui: str | None = None)
     """
     if backend == "numeric":
         return Numeric(p.line)
-    from trainctl.sumo.session import Sumo
-    from trainctl.sumo.signal_box import obeyed
+    with ThreadPoolExecutor(1) as beside:  # netconvert takes as long as loading SUMO does
+        made = beside.submit(_net, p, folder)
+        from trainctl.sumo.session import Sumo
+        from trainctl.sumo.signal_box import obeyed
 
-    run, (net, place) = p.scenario.run, _net(p, folder)
+    run, (net, place) = p.scenario.run, made.result()
     if gui is not None:
         from trainctl.sumo.gui import Gui, Map
 

@@ -99,6 +99,8 @@ def _summary(folder: Path, info: dict[str, Any]) -> None:
     for word, c in (("the scenario", start), ("the best", best)):
         if c["reason"]:
             say(f"{word}: {c['reason']}")
+    if info["refused"]:
+        say(f"{info['refused']} of {info['candidates']} candidates gave nothing, the first: {info['refusal']}")
     if info["bounds_kept"]:
         say(f"results: {folder}/  (tuned.toml, search.parquet, search.png)")
     else:

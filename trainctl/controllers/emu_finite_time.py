@@ -31,7 +31,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -336,16 +335,18 @@ def largest_sub_step(params: Params, scene: Scene) -> float:
     An estimate, no proof: of random starts and gains 1 to 2 in 100 need up to a tenth less, or run into a coupler's end anyway.
     """
     c, first, consists = constants(params, scene), scene.consists.first, scene.consists
-    leader, links = np.zeros(4), scene.links
-    leader_at(scene.reference, scene.time, scene.time, leader)
-    limits = np.column_stack([consists.traction, consists.traction_power, consists.braking, consists.braking_power])
-    own = np.ascontiguousarray(scene.own[:, :2])
-    w = rehearse(c, limits, leader, links.slot, links.sender, links.first, links.desired, own, REHEARSAL_STEP, REHEARSAL_STEPS)
-    fastest, bounded = 0.0, np.isfinite(consists.traction) & np.isfinite(consists.braking)
-    for a, b in pairwise(first):
-        if b - a < 2:
-            continue
-        if bounded[a:b].all():
+    bounded = np.logical_and.reduceat(np.isfinite(consists.traction) & np.isfinite(consists.braking), first[:-1])
+    several = np.diff(first) > 1
+    w, fastest = np.ones(len(consists.mass)), 0.0
+    if (several & ~bounded).any():  # else nothing would be asked of what is rehearsed, and that takes most of the time
+        leader, links = np.zeros(4), scene.links
+        leader_at(scene.reference, scene.time, scene.time, leader)
+        limits = np.column_stack([consists.traction, consists.traction_power, consists.braking, consists.braking_power])
+        own = np.ascontiguousarray(scene.own[:, :2])
+        w = rehearse(c, limits, leader, links.slot, links.sender, links.first, links.desired, own, REHEARSAL_STEP, REHEARSAL_STEPS)
+    for i in np.flatnonzero(several).tolist():
+        a, b = first[i], first[i + 1]
+        if bounded[i]:
             w[a:b] = 1.0
             fastest = max(fastest, RUNGE_KUTTA_LIMIT / BOUNDED_STEP)
         k_p1 = c.units[a : b - 1, K_HAT] / c.p1

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sumo_net.bounded import short_text
+from sumo_net.bounded import reason, short_text
 from trainctl.errors import InputError
 from trainctl.runs.kinds import KINDS
 
@@ -152,7 +152,7 @@ def read_tolerances(path: Path | str) -> Tolerances:
     try:
         data = tomllib.loads(short_text(Path(path)))
     except (ValueError, RecursionError) as error:  # not TOML, not text, a number of 5000 digits
-        raise InputError(f"{path}: not a TOML file: {error}") from None
+        raise InputError(f"{path}: not a TOML file: {reason(error)}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     return parse_tolerances(data, str(path))

@@ -137,7 +137,7 @@ def simulated(stack: Stack) -> Done:
     tallied = units.watched(stack, p.scene(s.own, stack.links, 0.0)) if p.has_units else None
     while True:
         t, now, last = s.k * run.step_s, instants.get(s.k), s.k == run.steps
-        speed = s.own[p.leading, SPEED]
+        speed = p.speeds(s.own)
         if speed.max() > lowest + ROUNDING:
             limit, _ = on_track.limits(track, stack.ways, s.row, s.position, length, there)
             counts.violated[speed > limit + ROUNDING] |= count.ABOVE_LIMIT

@@ -141,7 +141,7 @@ class Ensemble:
         acting = disturbance.at(a.stack.signals, s.k, t, s.position)
         believed = a.plant.believed_resistance(s.own)
         exchanged = a.control.exchanged(s.k, t, s.own, believed, s.formed, s.messages, s.memory, acting)
-        return Now(exchanged, s.position, s.own[a.p.leading, SPEED], a.stack.links, a.left(s))
+        return Now(exchanged, s.position, a.p.speeds(s.own), a.stack.links, a.left(s))
 
     def close(self) -> None:
         """Nothing to leave."""
@@ -207,14 +207,14 @@ class Railway:
         loop = self._loop
         s, p, t = loop.state, loop.p, loop.time
         own = loop.measured(s)
-        formed, links, position = s.formed, s.formed.links, own[p.leading, POSITION]
+        formed, links, position = s.formed, s.formed.links, p.fronts(own)
         if links is None:  # before the first step
             links = p.first_links
             formed = formed._replace(links=links, constants=p.law.constants(p.params, p.scene(own, links, t)))
         acting = disturbance.at(loop.disturbances, s.k, t, position)
         believed = loop.plant.believed_resistance(own)
         exchanged = loop.control.exchanged(s.k, t, own, believed, formed, s.messages, s.memory, acting)
-        return Now(exchanged, position, own[p.leading, SPEED], links, ~loop.world.measure().present)
+        return Now(exchanged, position, p.speeds(own), links, ~loop.world.measure().present)
 
     def close(self) -> None:
         """End the run; its folder is complete, though the run may be shorter than it was to be."""

@@ -9,6 +9,9 @@ others, itself. A stretch is granted, and a train let into the net, only if it d
 A train that turns stands at the end of its way, and needs besides those that may stand where it runs back: on its next leg, on the
 twin of that or across, but for those ahead of it that it turns its rear to.
 
+Orders are needs as well: who must let another train pass first needs that until it comes to a stand beyond the place only. They can
+forbid every way out, which is looked for before a run (``solvable``); what the rule then grants is free of circles all the same.
+
 Circles of joins alone, without single track or crossings, are not looked at (a roundabout that is full): those are told, see
 ``monitors.waiting``.
 
@@ -150,24 +153,33 @@ def _to_pass(ways: Ways, row: Ints, limits: Mapping[int, int]) -> tuple[Ints, In
     return np.repeat(trains, count), np.arange(len(skipped)) + skipped
 
 
+def rears(here: Standing) -> dict[int, float]:
+    """How far back the rear of every train may come to stand [m]; who runs on to the end of its way is not in it."""
+    found: dict[int, float] = {}
+    for trains in here.on.values():
+        for i, _, rear in trains:
+            found[i] = min(rear, found.get(i, rear))
+    return found
+
+
 def needs(here: Standing, i: int, goes_before: Before) -> Iterable[int]:
     """Trains that must have gone before ``i`` can leave."""
-    ways = here.ways
+    ways, row = here.ways, int(here.row[i])
     yield from here.before.get(i, ())
-    row = int(here.row[i])
-    for k in (row + np.flatnonzero(here.near[ways.edge[row : ways.first[i + 1]]])).tolist():
+    for k in (row + np.flatnonzero(here.near[ways.edge[row : ways.first[i + 1]]])).tolist():  # few are, of long ways
         yield from against(here, i, k)
         for j, m, _ in here.on.get(int(ways.edge[k]), ()):
             if j != i and i not in here.before.get(j, ()) and goes_before(j, m, i, k):
                 yield j
-    yield from _behind(here, i, goes_before)
+    if i in here.back:
+        yield from _behind(here, i, goes_before)
 
 
 def _behind(here: Standing, i: int, goes_before: Before) -> Iterable[int]:
     """Trains that must have gone before ``i`` can run back once it has turned."""
     net, ways = here.net, here.ways
     rows = {int(ways.edge[k]): k for k in range(int(ways.first[i]), int(ways.first[i + 1]))}
-    for e in here.back.get(i, ()):
+    for e in here.back[i]:
         yield from (j for j, _, _ in here.on.get(e, ()) if j != i)
         for f in (int(net.twin[e]), *net.cross[net.cross_first[e] : net.cross_first[e + 1]].tolist()):
             for j, m, _ in here.on.get(f, ()):

@@ -67,10 +67,19 @@ def short_of_junctions(ways: Ways, net: Net, internal: Bools, row: Ints, s: Floa
     return found
 
 
+class Ordered(NamedTuple):
+    """A train that must not enter row ``row`` of its way before another one has entered row ``at`` of its own."""
+
+    train: int
+    row: int
+    first: int
+    at: int
+
+
 def passes_first(
     pairs: Iterable[tuple[int, int, int]], net: Net, ways: Ways, row: Ints, came: Bools, never: Bools
-) -> list[tuple[int, int, int]]:  # fmt: skip
-    """Trains that must let another one pass an edge first: train, row of the edge in its way, the other one.
+) -> list[Ordered]:  # fmt: skip
+    """Trains that must let another one pass an edge first.
 
     Parameters
     ----------
@@ -90,7 +99,7 @@ def passes_first(
         if not all(map(len, rows)) or never[first]:
             continue
         if not (came[first] and row[first] >= rows[0][0]) and not (came[then] and row[then] >= rows[1][0]):
-            found.append((then, int(rows[1][0]), first))
+            found.append(Ordered(then, int(rows[1][0]), first, int(rows[0][0])))
     return found
 
 
@@ -185,6 +194,23 @@ def under(ways: Ways, row: Ints, s: Floats, length: Floats, i: int) -> Iterable[
     while k > ways.first[i] and ways.begin[k] > s[i] - length[i]:
         k -= 1
         yield k
+
+
+def in_place_of(trains: Trains, present: Bools, outside: list[int], clearance: float) -> dict[int, int]:
+    """Trains that are to enter where another one is: which."""
+    ways, row, s, length = trains.zones.ways, trains.row, trains.s, trains.length
+    on: dict[int, list[tuple[int, float]]] = {}
+    for j in np.flatnonzero(present).tolist() if outside else ():
+        for k in under(ways, row, s, length, j):
+            on.setdefault(int(ways.edge[k]), []).append((j, s[j] - ways.begin[k]))
+    found = {}
+    for i in outside:
+        for k in under(ways, row, s, length, i):
+            depth = s[i] - ways.begin[k]
+            for j, other in on.get(int(ways.edge[k]), ()):
+                if other - length[j] < depth + clearance and other > depth - length[i]:
+                    found[i] = j
+    return found
 
 
 @njit(cache=True)

@@ -17,6 +17,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from sumo_net.bounded import reason
 from trainctl.errors import InputError
 from trainctl.record.folder import FORMAT, INFO, SCHEMA_VERSION
 from trainctl.runs.schema import INFO as FIELDS
@@ -150,7 +151,7 @@ class Run:
         try:
             return tomllib.loads(_bytes(path).decode())
         except (ValueError, RecursionError) as error:  # not TOML, not text, a number of 5000 digits
-            raise InputError(f"{path}: {error}") from None
+            raise InputError(f"{path}: {reason(error)}") from None
 
     def files(self, table: str) -> list[Path]:
         """The Parquet files of a table: one, or the closed segments of a run that was killed."""
@@ -241,7 +242,7 @@ def _json(path: Path) -> Any:
     try:
         return json.loads(_bytes(path))
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not JSON: {error}") from None
+        raise InputError(f"{path}: not JSON: {reason(error)}") from None
 
 
 def _first_line(error: Exception) -> str:

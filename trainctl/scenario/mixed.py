@@ -13,10 +13,14 @@ from typing import Literal
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
+import numpy as np
+
 from sumo_net import Rails
+from trainctl.railway.ways import Ways
 from trainctl.scenario.events import Order
 from trainctl.scenario.tables import TrafficTable
 from trainctl.signals import Bools, Ints
+from trainctl.traffic.handed import Handed
 from trainctl.traffic.rail_signals import Signal
 
 #: More edges than this are counted, not named.
@@ -63,6 +67,16 @@ def chosen(
     return "obey", [f"traffic.signals = obey: chosen since {why}{other}"], []
 
 
+def of_formations(together: Bools, options: Mapping[str, str]) -> list[str]:
+    """What signals do to formations of trains that cooperate (n,), where they are obeyed; ``options`` are those of the files."""
+    if together.sum() < 2 or options.get("railsignal-moving-block", "false").lower() in ("true", "1", "yes", "on"):
+        return []
+    return [
+        f"traffic.signals = obey: a signal lets one train at a time into its block, so it draws formations of the {together.sum()}"
+        " trains that cooperate apart; SUMO's option railsignal-moving-block lets them pass together"
+    ]
+
+
 def unguarded(ways: Sequence[Ints], ids: Sequence[str], rails: Rails, signals: Sequence[Signal]) -> list[str]:
     """Joins and single track that two trains use, and that some train comes to without a rail signal before it.
 
@@ -94,6 +108,15 @@ def unguarded(ways: Sequence[Ints], ids: Sequence[str], rails: Rails, signals: S
             last = edge
     named = [f"before edge {rails.edges[e]} for train {_some(trains)}" for e, trains in found.items()]
     return named if len(named) <= MOST else [*named[:MOST], f"before {len(named) - MOST} more edges"]
+
+
+def without_signal(
+    ways: Ways, i: int, row: int, edges: Sequence[int] | Ints, ids: Sequence[str], rails: Rails, signals: Sequence[Signal]
+) -> str:
+    """A place that two trains may want and that has no signal before it if ``i`` runs over ``edges`` from ``row`` on; "": none."""
+    all_of_them = [ways.edge[a:b] for a, b in pairwise(ways.first.tolist())]
+    all_of_them[i] = np.concatenate([ways.edge[ways.first[i] : row], np.asarray(edges, np.int64)])
+    return next(iter(unguarded(all_of_them, ids, rails, signals)), "")
 
 
 def constraints(
@@ -149,6 +172,19 @@ def unkept(elements: Sequence[Element], signals: Sequence[Signal], trips: Collec
             if foes and one.get("tripId") in trips:
                 notes.append(f"{who}: {one.tag}: {', '.join(foes)}: no such train: {one.get('tripId')} waits for it for ever")
     return wrong, notes
+
+
+def yielding(handed: Handed | None, edge: Ints) -> set[int]:
+    """Trains that constraints keep out of the net until another one has come over the same edge; ``edge`` (n,): where they come."""
+    if handed is None:
+        return set()
+    number = {trip: i for i, trip in enumerate(handed.trips)}
+    found = set()
+    for element in map(ElementTree.fromstring, handed.additional):
+        for one in (one for one in element if one.tag in ("insertionPredecessor", "insertionOrder")):
+            i, foes = number.get(one.get("tripId", ""), -1), [number[f] for f in one.get("foes", "").split() if f in number]
+            found |= {i for j in foes if i >= 0 and edge[i] == edge[j]}
+    return found
 
 
 def _before(route: Sequence[str], edges: Collection[str], rails: Rails, at: Mapping[tuple[str, str], str]) -> str | None:

@@ -17,7 +17,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from sumo_net.bounded import short_text
+from sumo_net.bounded import reason, short_text
 from trainctl.errors import InputError
 from trainctl.scenario.reference import FORMS
 from trainctl.scenario.tables import Scenario
@@ -83,7 +83,7 @@ def _read(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
     try:
         data = tomllib.loads(short_text(path))
     except (ValueError, RecursionError) as error:  # not TOML, not text, a number of 5000 digits
-        raise InputError(f"{path.name}: not a TOML file: {error}") from None
+        raise InputError(f"{path.name}: not a TOML file: {reason(error)}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     base = data.pop("extends", None)

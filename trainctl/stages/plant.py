@@ -113,7 +113,7 @@ class Points:
         """A point has no couplers."""
         return np.zeros(len(own))
 
-    def overrun(self, own: Floats, braking: float) -> Floats:
+    def overrun(self, own: Floats, braking: Floats) -> Floats:
         """Nothing acts late here."""
         return np.zeros(len(own))
 
@@ -158,6 +158,7 @@ class Units:
         )
         self.masses = p.consists.train_mass()
         self.lag = p.assumed.lag
+        self.supervised = p.supervision.mode != "off"
         self.hilly = bool(len(self.gradient)) or bool(p.net_slope.any())
         ordered = p.looks_ahead or p.braked
         # Written anew in every step before they are read, like the columns of the plant's table that disturb it.
@@ -296,14 +297,18 @@ class Units:
     def _asked(self, began: Floats, moved: Floats, way: Floats, calm: bool) -> Floats:
         """Acceleration that drives every train over the step [m/s2], (n,); NaN where it stops harder than full braking.
 
+        Where no supervisor asks it is the mean.
+
         Where actuators lag it is what they approach; else the mean, or the one that explains the ``way`` (n,) where that is more (a
         law pulls first and brakes later within the step) or less than full braking (it brakes first). ``began`` is the state after
         the disturbance of the speed; what else disturbs, unless the step is ``calm``, is in it.
         """
         leading, full = self.p.leading, self.p.supervision.emergency_mps2
-        hardest: float | Floats = full if calm else full + self.p.assumed.scatter
         v, after = began[leading, SPEED], moved[leading, SPEED]
-        mean = (after - v) / self.step_s
+        mean: Floats = (after - v) / self.step_s
+        if not self.supervised:
+            return mean
+        hardest: float | Floats = full if calm else full + self.p.assumed.scatter
         drives = mean + (self.swing(moved) - self.swing(began)) / self.step_s
         late = self.p.plant.STATES > FORCE
         if late:
@@ -338,7 +343,12 @@ class Units:
         return np.where(own[leading, SPEED] > 0.0, found, np.maximum(found, 0.0))
 
     def swing(self, own: Floats) -> Floats:
-        """By how much couplers, and units against each other, may still speed up every head [m/s], (n,): all of their energy."""
+        """By how much couplers, and units against each other, may still speed up every head [m/s], (n,): all of their energy.
+
+        0 where no supervisor asks.
+        """
+        if not self.supervised:
+            return np.zeros(len(self.masses))
         c, v = self.p.consists, own[:, SPEED]
         units = np.diff(c.first)
         mean = np.add.reduceat(c.mass * v, c.first[:-1]) / self.masses
@@ -349,8 +359,8 @@ class Units:
         more: Floats = np.maximum(fastest - v[self.p.leading], 0.0)
         return more
 
-    def overrun(self, own: Floats, braking: float) -> Floats:
-        """How much farther every train runs to standstill than by ``braking`` [m/s2] from now on, as actuators act late [m], (n,).
+    def overrun(self, own: Floats, braking: Floats) -> Floats:
+        """How much farther every train runs to standstill than by ``braking`` (n,) [m/s2] from now on, as actuators act late [m].
 
         Until its brakes act a train gains the speed (a + b) / r on the plan, and loses it only by braking to the end.
         """

@@ -14,6 +14,7 @@ from trainctl.railway.authority import DRIVER_MARGIN_M, View
 from trainctl.railway.interlocking import Held
 from trainctl.railway.ways import Ways, moved, unchanged
 from trainctl.record.columns import Call
+from trainctl.scenario import mixed
 from trainctl.scenario.model import Model
 from trainctl.scenario.roster import Stop
 from trainctl.signals import Bools, Floats, Ints, Seen
@@ -101,15 +102,13 @@ class Traffic:
         self.room = Room(p)
         self.net, self.length = along.net(p.rails), p.consists.train_length()
         self.looks, self.join_range_m = p.looks_ahead, p.driving.join_range_m if p.driven else 0.0
-        planned = min(
-            p.supervision.emergency_mps2, p.supervision.service_mps2, *([p.driving.deceleration_mps2] if p.driven else [])
-        )
+        planned = np.minimum(p.supervision.service_mps2, p.driver_braking if p.driven else p.supervision.emergency_mps2)
         self.requesting = np.minimum(p.assumed.braking, planned)  # what is requested for, and braked with at least
         number = {name: i for i, name in enumerate(p.scenario.ids)}
-        # Pairs of trains that pass an edge one after the other: edge, who goes first, who comes next.
-        self.pairs = [
+        self.pairs = [  # edge, who passes it first, and who comes next
             (p.rails.index[order.edge], number[a], number[b]) for order in p.scenario.order for a, b in pairwise(order.trains)
         ]
+        self.yields = mixed.yielding(p.roster.handed, p.roster.edge)
         self.settles = float(np.max(supervisor.settles(p.assumed, p.assumed.braking), initial=0.0))
         self.ways: Ways | None = None
         self._limits(0.0)
@@ -208,18 +207,19 @@ class Traffic:
         return s._replace(parked=parked)
 
     def due(self, t: float, s: State) -> list[int]:
-        """Trains that are to come at ``t``: of each edge the first that waits there."""
+        """Trains that are to come at ``t``: of each edge the first that waits there, and the next if SUMO lets that go first."""
         if s.came.all():
             return []
-        first: dict[int, int] = {}
+        found, taken = list[int](), set[int]()
         for i in np.flatnonzero(~s.came & ~self.roster.driven & (self.roster.depart <= t + 1e-9) & ~self._given_up(t)).tolist():
-            first.setdefault(int(self.roster.edge[i]), i)
-        return sorted(first.values(), key=lambda i: (self.roster.depart[i], i))
+            if (edge := int(self.roster.edge[i])) not in taken:
+                found.append(i)
+                taken |= set() if i in self.yields else {edge}
+        return sorted(found, key=lambda i: (self.roster.depart[i], i))
 
     def _given_up(self, t: float) -> Bools:
         """Trains that would not come any more if they had not yet."""
-        late: Bools = t > self.roster.depart + self.roster.patience + 1e-9
-        return late
+        return np.asarray(t > self.roster.depart + self.roster.patience + 1e-9)
 
     def missing(self, t: float, s: State) -> list[str]:
         """Trains that were due and never came."""
@@ -268,7 +268,8 @@ class Traffic:
             if v is None:
                 kept_out[i] = waiting.kept_out(view, i)
                 continue
-            came[i], entering[i], speed[i], together = True, True, v, None
+            # Who may not come yet is in no other's way.
+            present[i], came[i], entering[i], speed[i], together = i not in self.yields, True, True, v, None
             reach = self._reach(speed)
             come.append((i, v))
         keeping = np.full(len(speed), -1)
@@ -458,7 +459,7 @@ class Traffic:
         braking = supervisor.stopping_distance(v, self.requesting, self.step_s, self.theta)
         return braking + 4.0 * v * self.step_s + rules.margin_m + 2.0 * DRIVER_MARGIN_M + 50.0 + 6.0 * assumed.uncertainty
 
-    def _ordered(self, t: float, ways: Ways, seen: Seen, s: State) -> list[tuple[int, int, int]]:
+    def _ordered(self, t: float, ways: Ways, seen: Seen, s: State) -> list[zones.Ordered]:
         """Trains that must let another one pass an edge first, see ``zones.passes_first``."""
         return zones.passes_first(self.pairs, self.net, ways, seen.row, s.came, s.left | ~s.came & self._given_up(t))
 

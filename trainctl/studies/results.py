@@ -37,6 +37,12 @@ def wilson(hits: int, total: int, z: float = Z_95) -> tuple[float, float] | None
     return low, 1.0 if hits == total else min(1.0, centre + half)
 
 
+def percents(interval: Sequence[float]) -> str:
+    """An interval of shares in per cent, in words."""
+    low, high = (f"{100.0 * end:.2g}" if end < 0.995 else f"{100.0 * end:.3g}" for end in interval)
+    return f"{low} .. {high} %"
+
+
 class Part(NamedTuple):
     """Results of k runs, column by column."""
 

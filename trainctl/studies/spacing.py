@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import tomli_w
 
-from trainctl.errors import InputError, TrainctlError
+from trainctl.errors import InputError, TrainctlError, left_out
 from trainctl.record.folder import write_json
 from trainctl.signals import POSITION, SPEED, Trains
 from trainctl.studies.capacity import LAW_ROWS
@@ -25,6 +25,7 @@ from trainctl.studies.stops import (
     SAFE,
     Outcome,
     StopsPlan,
+    has_sumo,
     line,
     prepared,
     reference_lines,
@@ -260,7 +261,7 @@ def compare(
     InputError
         A number of the plan that makes no sense.
     """
-    if mistakes := wrong(plan):
+    if mistakes := [*wrong(plan), *([f"--in-sumo: {left_out('libsumo')}"] if sumo and not has_sumo() else [])]:
         raise InputError(mistakes)
     out.mkdir(parents=True, exist_ok=True)
     todo = [row for row in rows if not (resume and _asked_the_same(plan, out / row))]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from trainctl.studies.compare import escaped
+from trainctl.studies.results import percents
 from trainctl.studies.stops import REFUSED, StopsPlan, reference_lines
 
 #: Columns of the printed table -> keys.
@@ -33,8 +34,7 @@ def cells(row: Mapping[str, Any]) -> list[Any]:
 
 
 def _interval(point: Mapping[str, Any]) -> str:
-    low, high = (100.0 * end for end in point["interval_95"])
-    return f"{point['failed']} of {point['of']} ({low:.2g} .. {high:.2g} %)"
+    return f"{point['failed']} of {point['of']} ({percents(point['interval_95'])})"
 
 
 def _share(point: Mapping[str, Any]) -> str:

@@ -22,6 +22,7 @@ import math
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -222,6 +223,11 @@ def unwatched(p: Model, world: World | None = None) -> Loop:
     loop = Loop(p, world or Numeric(p.line), journal)
     loop.record = Unwatched(p, journal)
     return loop
+
+
+def has_sumo() -> bool:
+    """Whether SUMO is here; a light install is without."""
+    return find_spec("libsumo") is not None
 
 
 @contextmanager

@@ -28,7 +28,7 @@ from trainctl.record.folder import write_json
 from trainctl.signals import POSITION, SPEED
 from trainctl.studies.capacity import BAND_MPS, LAW_ROWS
 from trainctl.studies.results import wilson
-from trainctl.studies.stops import REFUSED, ROUNDING_MPS, ROWS, StopsPlan, scenario, sumo, unwatched
+from trainctl.studies.stops import REFUSED, ROUNDING_MPS, ROWS, StopsPlan, has_sumo, scenario, sumo, unwatched
 
 if TYPE_CHECKING:
     from trainctl.loop import Loop
@@ -197,7 +197,7 @@ def tables_of(plan: SuitePlan, row: str, situation: str) -> tuple[Tables, Tables
 
 
 def cell(plan: SuitePlan, row: str, situation: str, folder: Path) -> Cell:
-    """Run a cell, and its first run in SUMO as well; its files lie in ``folder``."""
+    """Run a cell, and its first run in SUMO as well, if that is installed; its files lie in ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
     try:
         p = _prepared(plan, row, situation, folder)
@@ -211,6 +211,8 @@ def cell(plan: SuitePlan, row: str, situation: str, folder: Path) -> Cell:
         row, situation, "run", "", int(ran.failed.sum()), plan.runs, float(ran.gap.min()), float(np.median(ran.error)),
         float(np.median(ran.jerk)), int((ran.gap < 0.0).sum()), float(ran.faster.max()), float(ran.gap[0]),
     )  # fmt: skip
+    if not has_sumo():
+        return found
     first = _prepared(plan._replace(runs=1), row, situation, folder)
     with sumo(first, folder) as world:
         there = _ran(unwatched(first, world), plan._replace(runs=1))

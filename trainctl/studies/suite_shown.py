@@ -7,12 +7,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from trainctl.studies.results import percents
 from trainctl.studies.stops import REFUSED
 from trainctl.studies.suite import SITUATIONS, SuitePlan
 
 STYLE = """
 body { font: 14px/1.45 system-ui, sans-serif; margin: 2em; color: #222; }
 table { border-collapse: collapse; } th, td { padding: .35em .7em; text-align: left; border-bottom: 1px solid #ddd; }
+td { white-space: nowrap; }
 td small { color: #555; display: block; } .good { background: #e3f4ec; } .bad { background: #fbe3d6; } .refused { color: #777; }
 """
 
@@ -21,8 +23,7 @@ def words(cell: Mapping[str, Any]) -> str:
     """What came of a cell, short: so many runs failed, with the interval of the share."""
     if cell["what"] == REFUSED:
         return REFUSED
-    low, high = (100.0 * end for end in cell["interval_95"])
-    return f"{cell['failed']} of {cell['of']} ({low:.2g} .. {high:.2g} %)"
+    return f"{cell['failed']} of {cell['of']} ({percents(cell['interval_95'])})"
 
 
 def grid(cells: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[str], dict[tuple[str, str], Mapping[str, Any]]]:
@@ -67,8 +68,9 @@ def _text(name: str) -> str:
 def _cell(cell: Mapping[str, Any]) -> str:
     if cell["what"] == REFUSED or cell["gap_m"] is None:
         return f"<td class='refused'>{words(cell)}</td>"
-    why = f"touched {cell['contacts']}, too fast by {max(cell['faster_mps'], 0.0):.2g} m/s<br>" if cell["failed"] else ""
-    more = f"{why}gap {cell['gap_m']:.4g} m<br>error {cell['error_m']:.3g} m<br>jerk {cell['jerk_rms_mps3']:.2g} m/s³"
+    fast = max(cell["faster_mps"], 0.0)
+    why = f"touched {cell['contacts']}<br>{fast:.2g} m/s too fast<br>" if cell["failed"] else ""
+    more = f"{why}gap {cell['gap_m']:.0f} m<br>error {cell['error_m']:.0f} m<br>jerk {cell['jerk_rms_mps3']:.2g} m/s³"
     return f"<td class='{'bad' if cell['failed'] else 'good'}'>{words(cell)}<small>{more}</small></td>"
 
 

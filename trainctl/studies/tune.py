@@ -130,6 +130,8 @@ def objective(text: str) -> dict[str, float]:
     found: dict[str, float] = {}
     for piece in text.split(","):
         name, equals, weight = (word.strip() for word in piece.partition("="))
+        if name in found:
+            raise InputError(f"--objective {name}: given twice")
         if name not in OBJECTIVES:
             raise InputError(f"--objective {name}: no such objective; known: {', '.join(OBJECTIVES)}")
         try:
@@ -165,7 +167,9 @@ def prepared(plan: TunePlan) -> Model:
     said = ", ".join(f"{key} = {value:g}" for key, value in known.items())
     if not plan.gains:
         raise InputError(f"--gain: missing; the numbers of law {law} are {said}")
-    wrong = [f"--gain {g.name}: not a number of law {law}; there are: {said}" for g in plan.gains if g.name not in known]
+    names = [g.name for g in plan.gains]
+    wrong = [f"--gain {name}: not a number of law {law}; there are: {said}" for name in names if name not in known]
+    wrong += [f"--gain {name}: given more than once" for name in dict.fromkeys(names) if names.count(name) > 1]
     if wrong:
         raise InputError(wrong)
     if (why := alone(model)) is not None:
@@ -268,6 +272,7 @@ def tune(
         now = numbers(model)
         found = _searched(plan, tuple(now[g.name] for g in plan.gains), workers or os.cpu_count() or 1, progress)
         start, best = found[0], min(found, key=lambda c: c.value)
+        refused = [c for c in found if c.reason]
         frame = table(plan, found)
         frame.to_parquet(out / TABLE, index=False)
         from trainctl.figures.tune import search
@@ -280,6 +285,7 @@ def tune(
             "format": FORMAT, "scenario": model.file, "law": model.scenario.controller.law,
             "gains": {g.name: [g.low, g.high] for g in plan.gains}, "objective": dict(plan.objective), "set": dict(plan.settings),
             "seeds": list(plan.seeds), "jitter": dict(plan.jitter), "candidates": len(found), "bounds_kept": kept,
+            "refused": len(refused), "refusal": refused[0].reason if refused else None,
             "start": _told(plan, start), "best": _told(plan, best),
             "versions": {name: installed(p) for name, p in (("trainctl", "trainctl"), ("scipy", "scipy"))},
             "command_line": list(command_line), "wall_time_s": round(time.perf_counter() - began, 3),

@@ -193,7 +193,10 @@ class Sumo(Session):
         self.seen = Seen(self.ways.begin[row] + start.lane_position, self.ways.edge[row], row, present)
         self.seen.position[everyone] = self.ways.begin[row[everyone]] + self._lane_positions(everyone)
         if self.obeyed is not None:
-            self.idle, self.box = False, Box(self, self.obeyed)
+            self.idle, self.box = (
+                False,
+                Box(self, self.obeyed, _direct(self.api.trafficlight.getRedYellowGreenState, "trafficlight")),
+            )
             self.seen = self.box.read().within(self.seen, self.ways)
         if self.idle:
             with silent():
@@ -452,10 +455,10 @@ class Sumo(Session):
         return cause(self.api, self.ids[i], edges[0], normal(edges))
 
 
-def _direct(function: Any) -> Any:
+def _direct(function: Any, domain: str = "vehicle") -> Any:
     """Find the compiled function that a function of libsumo hands its arguments on to: handing on takes a third of a call."""
     compiled = getattr(sys.modules.get(function.__module__), "_libsumo", None)
-    return getattr(compiled, f"vehicle_{function.__name__}", function)
+    return getattr(compiled, f"{domain}_{function.__name__}", function)
 
 
 def _ended(path: Path) -> bool:

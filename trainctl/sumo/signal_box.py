@@ -6,6 +6,7 @@ driver wants is overruled all the same. SUMO lets no train in before the block i
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -74,12 +75,11 @@ class Read(NamedTuple):
 class Box:
     """The signals of a session that runs, and its trains that SUMO drives."""
 
-    def __init__(self, session: Session, obeyed: Obeyed) -> None:
-        self.session, self.obeyed = session, obeyed
+    def __init__(self, session: Session, obeyed: Obeyed, state: Callable[[str], str]) -> None:
+        self.session, self.obeyed, self.state = session, obeyed, state
         self.number = {name: i for i, name in enumerate(session.ids)}
         self.own = np.flatnonzero(obeyed.driven)
         self.speed = np.full(len(session.ids), np.nan)
-        self.state = session.api.trafficlight.getRedYellowGreenState
         self.parked: list[int] = []
         self.claims: list[list[int]] = []
         self.held: dict[tuple[int, int], set[tuple[str, str]]] = {}  # for each claim: signal and trip of those it holds

@@ -193,6 +193,12 @@ def test_rows_that_are_done_stay(tmp_path) -> None:
     assert not spacing._asked_the_same(PLAN._replace(loss=0.5), place.parent)
 
 
+def test_without_sumo_it_is_not_asked(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(spacing, "has_sumo", lambda: False)
+    with pytest.raises(InputError, match="--in-sumo: SUMO: libsumo is not installed"):
+        spacing.compare(PLAN, tmp_path, ("sliding_mode",), sumo=True)
+
+
 def test_a_plan_that_makes_no_sense_is_refused(tmp_path) -> None:
     with pytest.raises(InputError) as told:
         spacing.compare(StopsPlan(from_m=100.0, to_m=50.0, speed_mps=90.0), tmp_path)

@@ -46,6 +46,13 @@ def test_masses_that_nobody_knows_make_a_difference(tmp_path) -> None:
     assert set(errors.values()) == {-5.0, 5.0} and len(errors) == 12
 
 
+def test_without_sumo_cells_are_run_all_the_same(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(suite, "has_sumo", lambda: False)
+    found = cell(PLAN, "relative_braking", "calm", tmp_path)
+    assert found.what == "run" and found.sumo_failed is None
+    assert suite_shown.confirmed([found.plain()]) == "No cell was run in SUMO."
+
+
 def test_sumo_moves_the_first_run_of_a_cell_as_it_is_moved_without(tmp_path) -> None:
     found = cell(PLAN, "relative_braking", "leave", tmp_path)
     assert found.sumo_failed is False and found.sumo_gap_m == pytest.approx(found.first_gap_m, abs=1e-6)
@@ -92,7 +99,7 @@ CELLS = [
 def test_the_page_has_a_cell_for_each_pair_and_says_why(tmp_path) -> None:
     page = suite_shown.page(CELLS, SuitePlan())
     assert page.count("<td") == 4 and "class='bad'>3 of 20 (5.2 .. 36 %)" in page and "class='good'>0 of 20 (0 .. 16 %)" in page
-    assert "touched 1, too fast by 0.034 m/s" in page and page.count("touched 0") == 0
+    assert "touched 1<br>0.034 m/s too fast" in page and page.count("touched 0") == 0
     assert "one run of each of 2 cells as well: minimum gaps differ by at most 0.25 m" in page
     assert "a &lt; b &amp; c" in page and "no longer finite" in page and "src=" not in page
     assert suite_shown.write_page(CELLS, SuitePlan(), tmp_path).read_text() == page

@@ -91,3 +91,14 @@ def test_the_command_says_what_it_found(tmp_path, typed):
     code, lines = typed("tune", *given, "--objective", "speed")
     assert code == 2
     assert lines == ["--objective speed: no such objective; known: settling, margin, energy, jerk"]
+
+
+def test_what_is_asked_twice_is_refused_and_what_cannot_run_is_told(tmp_path, typed):
+    given = ["robust_constrained", "--seeds", "0..1", "--set", "run.duration_s=40", "--workers", "1", "--evaluations", "16"]
+    twice = ["--gain", "h_per_s=0.2..0.8", "--gain", "controller.h_per_s=0.1..0.9"]
+    code, lines = typed("tune", *given, *twice, "--objective", "energy", "--out", tmp_path / "a")
+    assert (code, lines) == (2, ["--gain h_per_s: given more than once"])
+    code, lines = typed("tune", *given, *twice[:2], "--objective", "energy,energy=2", "--out", tmp_path / "a")
+    assert (code, lines) == (2, ["--objective energy: given twice"])
+    info = tune(dataclasses.replace(PLAN, gains=(Gain("h_per_s", -5.0, -1.0),), evaluations=16), tmp_path / "b", workers=1)
+    assert 0 < info["refused"] == info["candidates"] - 1 and "must be above 0" in info["refusal"]

@@ -125,7 +125,9 @@ def test_what_is_wrong_is_told_in_words(imported, data, words):
 
 @pytest.mark.parametrize(
     ("content", "words"),
-    [(b'{"a": ', "not JSON"), (b"a: [", "neither JSON nor YAML"), (b"hello", "neither format"), (b"\xff\xfe", "not text"), (b"", "neither format")],
+    [(b'{"a": ', "not JSON"), (b"a: [", "neither JSON nor YAML"), (b"hello", "neither format"), (b"\xff\xfe", "not text"), (b"", "neither format"),
+     (b'{"a": ' + b"[" * 100_000, "not JSON: nested too deeply"), (b"a: " + b"[" * 20_000, "neither JSON nor YAML: nested too deeply"),
+     (b" " * (1 << 24) + b"a", "neither format: longer than 16 MiB")],
 )  # fmt: skip
 def test_what_is_no_such_file_is_told_in_words(tmp_path, content, words):
     (tmp_path / "x.txt").write_bytes(content)

@@ -145,6 +145,16 @@ def test_runs_side_by_side_are_as_many_train_steps_as_it_says(monkeypatch):
     assert ensembles.table(rows).splitlines()[-1] == "two processes at once do 1.8 times what one does"
 
 
+def test_agents_are_measured_beside_the_loop():
+    command = [sys.executable, FILE, "--environment", "3", "--repeats", "1", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    rows = {row["case"]: row for row in json.loads(done.stdout)}
+    assert list(rows) == ["vector", "vector_random", "parallel", "reset", "loop", "sumo_vector", "sumo_parallel"]
+    assert rows["loop"]["to_loop"] == 1.0 and rows["sumo_vector"]["to_loop"] > 0.0
+    assert rows["vector"]["million_per_s"] > rows["sumo_vector"]["million_per_s"] > 0.0
+
+
 def test_the_country_s_timetable_has_the_trains_it_says_and_all_ways_are_on_its_net(monkeypatch):
     monkeypatch.syspath_prepend(str(FILE.parent))
     country = importlib.import_module("country")
