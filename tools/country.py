@@ -151,7 +151,7 @@ def timetable(net: Plan, corridors: int, runs: int, day_s: float, seed: int = 1)
         lines = ways[kind]
         for n in range(count):
             line, turn = n % len(lines), n // len(lines)
-            apart = day_s * len(lines) / max(count, 1)
+            apart = day_s / -(-count // len(lines))
             depart = turn * apart + apart * (line * 0.382 % 1.0)
             found.append((round(depart, 1), kind, line, turn))
     found.sort()
