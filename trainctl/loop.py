@@ -177,8 +177,8 @@ class Loop(Steps):
         for turn in around.turns:
             world.turn(*turn)
         world.move(moved.motion.displacement, p.scenario.run.step_s)
-        if world.box is not None and (kept := world.box.kept_parked()):
-            going = self.traffic.kept_parked(kept, going)
+        if world.box is not None and (kept := world.box.kept_parked()):  # they are to ask again
+            going = going._replace(parked=going.parked | np.isin(np.arange(len(going.parked)), kept))
         formed = self.topology.rule.after(formed)
         if around.turns:
             moved, formed = self._turned(t, [turn.train for turn in around.turns], moved, formed, going, watch)

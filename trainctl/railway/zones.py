@@ -44,8 +44,8 @@ def of(ways: Ways, net: Net, later: Sequence[int] | Ints = ()) -> Zones:
     return Zones(ways, net, *_stretches(ways, shared))
 
 
-def short_of_junctions(ways: Ways, net: Net, internal: Bools, row: Ints, s: Floats, room: Floats) -> Floats:
-    """Room (n,) [m] up to what trains must not enter yet, but not onto a junction on which another track comes in beside theirs.
+def short_of_junctions(ways: Ways, net: Net, internal: Bools, train: Ints, row: Ints, s: Floats, room: Floats) -> Floats:
+    """Room (k,) [m] up to what trains must not enter yet, but not onto a junction on which another track comes in beside theirs.
 
     Parameters
     ----------
@@ -53,17 +53,20 @@ def short_of_junctions(ways: Ways, net: Net, internal: Bools, row: Ints, s: Floa
         Of all trains.
     internal : ndarray of bool, shape (E,)
         Edges inside junctions.
-    row, s, room : ndarray, shape (n,)
-        Where the fronts are, and the room from there to the beginning of an edge [m]; inf: none.
+    row, s : ndarray, shape (n,)
+        Where the fronts are.
+    train, room : ndarray, shape (k,)
+        Trains, and the room from their fronts to the beginning of an edge [m]; inf: none.
     """
     found = room.copy()
-    for i in np.flatnonzero(np.isfinite(room) & (room > 0.0)).tolist():
+    for q in np.flatnonzero(np.isfinite(room) & (room > 0.0)).tolist():
+        i = int(train[q])
         a, b = int(row[i]), int(ways.first[i + 1])
-        k = a + int(np.searchsorted(ways.begin[a:b], s[i] + room[i] - TOUCH_M))
+        k = a + int(np.searchsorted(ways.begin[a:b], s[i] + room[q] - TOUCH_M))
         if k < b and net.joins[ways.edge[k]]:
             while k > a and internal[ways.edge[k - 1]]:
                 k -= 1
-            found[i] = max(ways.begin[k] - s[i], 0.0)
+            found[q] = max(ways.begin[k] - s[i], 0.0)
     return found
 
 

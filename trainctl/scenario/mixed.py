@@ -83,16 +83,18 @@ def unguarded(ways: Sequence[Ints], ids: Sequence[str], rails: Rails, signals: S
     A train that begins there needs none: SUMO does not let it in before the place is free.
     """
     stands = {(rails.index.get(s.edge, -1), rails.index.get(s.onward, -1)) for s in signals}
-    users: dict[int, int] = {}
+    users: dict[int, set[int]] = {}
     over: dict[int, set[int]] = {}  # edges that lead into each, as far as trains come over them
-    for way in ways:
+    for i, way in enumerate(ways):
         for edge in set(way.tolist()):
-            users[edge] = users.get(edge, 0) + 1
+            users.setdefault(edge, set()).add(i)
         for a, b in zip(way[:-1].tolist(), way[1:].tolist(), strict=True):
             over.setdefault(b, set()).add(a)
     single = {
-        e for e in users if any(other in users for other in (int(rails.twin[e]), *rails.crossing[e]) if other >= 0)
-    }  # fmt: skip
+        e
+        for e in users
+        if any(len(users[e] | users[other]) > 1 for other in (int(rails.twin[e]), *rails.crossing[e]) if other in users)
+    }
     found: dict[int, list[str]] = {}
     for name, way in zip(ids, ways, strict=True):
         guarded, last = False, int(way[0])
@@ -102,7 +104,7 @@ def unguarded(ways: Sequence[Ints], ids: Sequence[str], rails: Rails, signals: S
                 onward = next((e for e in way[k:].tolist() if not rails.internal[e]), -1)
                 guarded = not rails.internal[last] and (last, onward) in stands
             begun &= edge in single
-            shared = (k > 0 and len(over[edge]) > 1) or edge in single
+            shared = (k > 0 and len(over[edge]) > 1 and len(users[edge]) > 1) or edge in single
             if shared and not guarded and not begun and k > 0:
                 found.setdefault(edge, []).append(name)
             last = edge

@@ -214,7 +214,7 @@ def _lost(p: Model) -> list[str]:
     view = authority.look(
         laid, along.net(p.rails), p.rails.speed_mps, np.zeros(len(p.rails.speed_mps), bool), np.ones(n), row, front, speed,
         p.consists.train_length(), np.ones(n, bool),
-        fastest + 1000.0, np.full(n, np.inf), None,
+        fastest + 1000.0, np.full(n, np.inf), None, p.rails.internal,
     )  # fmt: skip
     found = []
     late, enough = supervisor.too_late(rules, p.assumed, speed, view.targets, step, p.step_theta)

@@ -200,12 +200,6 @@ class Traffic:
             )  # fmt: skip
         return s._replace(came=(s.came | there) & ~(s.entering & ~there), entering=np.zeros_like(s.entering))
 
-    def kept_parked(self, trains: Sequence[int], s: State) -> State:
-        """Trains that SUMO has not let back from where they are parked: they are to ask again."""
-        parked = s.parked.copy()
-        parked[trains] = True
-        return s._replace(parked=parked)
-
     def due(self, t: float, s: State) -> list[int]:
         """Trains that are to come at ``t``: of each edge the first that waits there, and the next if SUMO lets that go first."""
         if s.came.all():
@@ -346,9 +340,7 @@ class Traffic:
 
     def _place(self, stop: Stop, i: int, s: State) -> float:
         """Where train ``i`` has to stand now for a stop, or to have passed [m]: no farther than it may to turn afterwards."""
-        last = self.turns.last_place(i)
-        if stop.passing:
-            return min(stop.place, last - PASSED_M)
+        last = self.turns.last_place(i) - (PASSED_M if stop.passing else 0.0)
         return min(stop.place, last) - (stop.waits_before if self._full(stop, s) else 0.0)
 
     def _further(self, stop: Stop, i: int) -> float:
@@ -482,7 +474,8 @@ class Traffic:
                 )  # fmt: skip
             elif one.granted and not one.join and s.waits_for[one.train] >= 0:
                 self.journal.event(t, "switch_granted", train=ids[one.train], edge=edges[one.zone])
-        room = zones.short_of_junctions(ways, self.net, self.p.rails.internal, seen.row, seen.position, held.room)
+        everyone, inside = np.arange(len(held.room)), self.p.rails.internal
+        room = zones.short_of_junctions(ways, self.net, inside, everyone, seen.row, seen.position, held.room)
         return s._replace(requests=requests, waits_for=held.by.copy()), held._replace(room=room)
 
     def _look(self, ways: Ways, seen: Seen, speed: Floats, held: Held, s: State, reach: Floats) -> View:
@@ -497,5 +490,5 @@ class Traffic:
         return authority.look(
             ways, self.net, self.limit, self.falls, self.roster.speed_factor, seen.row, seen.position,
             np.where(self.roster.driven, 0.0, speed), self.length, seen.present, horizon, held.room, order,
-            supervisor.SIGNAL if self.p.obeys else supervisor.SWITCH,
+            self.p.rails.internal, supervisor.SIGNAL if self.p.obeys else supervisor.SWITCH,
         )  # fmt: skip
