@@ -52,6 +52,7 @@ class Standing(NamedTuple):
     row: Ints
     rear: Floats  # (n,) m, of every train now
     on: Mapping[int, Sequence[tuple[int, int, float]]]  # edge: trains that stand on it, its row in their ways, and their rears [m]
+    near: Bools  # (E,) edges on which, on whose twins or across which trains stand
     before: Mapping[int, Sequence[int]]  # train: those that go before it where it stands
     back: Mapping[int, Sequence[int]]  # train that turns: the edges it runs over then
 
@@ -80,7 +81,7 @@ def standing(
         Of trains that turn at the end of their ways: the edges they run over then.
     """
     on: dict[int, list[tuple[int, int, float]]] = {}
-    before: dict[int, list[int]] = {i: [] for i in limits}
+    before: dict[int, list[int]] = {}
     stood: Bools = np.zeros(len(net.length), bool)  # edges in ``on``
 
     def stands(i: int, front: float, k: int, room: float) -> list[int]:
@@ -109,19 +110,19 @@ def standing(
         trains.sort(key=lambda i: (ways.begin[limits[i]] - s[i], i))
         behind = 0.0
         for place, i in enumerate(trains):
-            before[i] += trains[:place]
+            before.setdefault(i, []).extend(trains[:place])
             behind += length[i]
             stands(i, float(ways.begin[limits[i]]), limits[i], behind)
             behind += clearance
-    for i, k in limits.items():
+    for i, k in limits.items() if back else ():
         if k < 0 and i in back:
             last = int(ways.first[i + 1]) - 1
             stands(i, float(ways.begin[last] + net.length[ways.edge[last]]), last, float(length[i]))
     for i, k, others in turns:
         if others:
-            before[i] += others
+            before.setdefault(i, []).extend(others)
             stands(i, float(ways.begin[k]), k, float(length[i]))
-    here, known, fresh = Standing(ways, net, row, s - length, on, before, back), set[tuple[int, int]](), True
+    known, fresh = set[tuple[int, int]](), True
     train, rows = _to_pass(ways, row, limits)
     edges = ways.edge[rows]
     while fresh:
@@ -131,14 +132,16 @@ def standing(
             place = heappop(places)
             i, k = int(train[place]), int(rows[place])
             for j, m, rear in tuple(on[int(edges[place])]):
-                if j != i and (i, j) not in known and i not in before[j] and goes_before(j, m, i, k):
+                if j != i and (i, j) not in known and i not in before.get(j, ()) and goes_before(j, m, i, k):
                     known.add((i, j))
                     fresh = True
                     new = stands(i, float(ways.begin[k] + max(rear - ways.begin[m], 0.0) - clearance), k, float(length[i]))
                     for e in new:
                         for more in np.flatnonzero(edges[place + 1 :] == e).tolist():
                             heappush(places, place + 1 + more)
-    return here
+    near = stood | (net.twin >= 0) & stood[net.twin]
+    near[np.repeat(np.arange(len(stood)), np.diff(net.cross_first))[stood[net.cross]]] = True
+    return Standing(ways, net, row, s - length, on, near, before, back)
 
 
 def _to_pass(ways: Ways, row: Ints, limits: Mapping[int, int]) -> tuple[Ints, Ints]:
@@ -161,15 +164,12 @@ def rears(here: Standing) -> dict[int, float]:
 
 def needs(here: Standing, i: int, goes_before: Before) -> Iterable[int]:
     """Trains that must have gone before ``i`` can leave."""
-    net, on, row = here.net, here.on, int(here.row[i])
+    ways, row = here.ways, int(here.row[i])
     yield from here.before.get(i, ())
-    edge = here.ways.edge[row : here.ways.first[i + 1]]
-    crossed = net.cross_first[edge + 1] > net.cross_first[edge]
-    for k, (e, twin, crosses) in enumerate(zip(edge.tolist(), net.twin[edge].tolist(), crossed.tolist(), strict=True), row):
-        if twin in on or crosses:  # few are, of long ways
-            yield from against(here, i, k)
-        for j, m, _ in on.get(e, ()):
-            if j != i and i not in here.before[j] and goes_before(j, m, i, k):
+    for k in (row + np.flatnonzero(here.near[ways.edge[row : ways.first[i + 1]]])).tolist():  # few are, of long ways
+        yield from against(here, i, k)
+        for j, m, _ in here.on.get(int(ways.edge[k]), ()):
+            if j != i and i not in here.before.get(j, ()) and goes_before(j, m, i, k):
                 yield j
     if i in here.back:
         yield from _behind(here, i, goes_before)

@@ -176,6 +176,7 @@ def request(
     room, zone, by = np.full(len(row), np.inf), np.full(len(row), -1, np.int64), np.full(len(row), -1, np.int64)
     behind: dict[int, int] = {}
     there = present.copy()  # and whoever is let in
+    here: deadlock.Standing | None = None  # where trains on the net may come to stand, as long as nothing more is granted
     for key in list(order):
         i, e = key
         k = stretches[key]
@@ -197,17 +198,19 @@ def request(
             if blocker < 0:
                 blocker = later if later >= 0 else waiting.blocker(i, rest)
             if blocker >= 0 and later < 0:
-                here = _standing(trains, there, granted, i, (), clearance, queues, joins, ordered, back)
+                if here is None or not there[i]:
+                    here = _standing(trains, there, granted, i, (), clearance, queues, joins, ordered, back)
                 stuck_itself = any(True for _ in deadlock.needs(here, blocker, trains.before(queues)))
                 if not (stuck_itself or _stood_on(here, zones.ends, i, [k, *rest])):
                     waiting.add(i, [k, *rest])
+                here = here if there[i] else None
             if blocker < 0 and outside[i]:  # no train comes in before one that waits for the same, whatever for
                 blocker = stuck.blocker(i, [k, *rest])
             if blocker < 0 and i in shut and rest and shut[i][0] <= zones.ends[rest[-1]]:
                 blocker = shut[i][1]
             if blocker < 0:
-                here = _standing(trains, there, granted, i, [k, *rest], clearance, queues, joins, ordered, back)
-                blocker = deadlock.in_a_circle(here, i, trains.before(queues))
+                with_it = _standing(trains, there, granted, i, [k, *rest], clearance, queues, joins, ordered, back)
+                blocker = deadlock.in_a_circle(with_it, i, trains.before(queues))
         if blocker >= 0:
             stuck.add(i, [k, *rest])
             behind.setdefault(e, i)
@@ -216,7 +219,7 @@ def request(
             if begin[k] - s[i] < room[i]:
                 room[i], zone[i], by[i] = max(begin[k] - s[i], 0.0), e, blocker
             continue
-        there[i] = True
+        there[i], here = True, None
         held.add(i, [k, *rest])
         for r in [k, *rest]:
             one = (i, int(edge[r]))

@@ -340,9 +340,7 @@ class Traffic:
 
     def _place(self, stop: Stop, i: int, s: State) -> float:
         """Where train ``i`` has to stand now for a stop, or to have passed [m]: no farther than it may to turn afterwards."""
-        last = self.turns.last_place(i)
-        if stop.passing:
-            return min(stop.place, last - PASSED_M)
+        last = self.turns.last_place(i) - (PASSED_M if stop.passing else 0.0)
         return min(stop.place, last) - (stop.waits_before if self._full(stop, s) else 0.0)
 
     def _further(self, stop: Stop, i: int) -> float:
