@@ -170,7 +170,8 @@ class Loop(Steps):
 
         # record, command and step
         watch = s.watch._replace(acting=acts)
-        together = going.on_track(here)
+        # Who comes back from where it was parked does so with the move, if it is let back: until then it is beside the track.
+        together = going._replace(parked=going.parked | s.traffic.parked).on_track(here)
         told = moved.motion._replace(input=np.where(self.ours, moved.motion.input, np.nan))
         self.record.step(s.k, t, ways, together, seen, own, formed, demand, told, past, acting, watch)
         self.record.waits(t, together, speed, going, around, self.traffic.due(t, going), watch)
