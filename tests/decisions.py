@@ -32,6 +32,7 @@ class Plan(NamedTuple):
     paths: list[list[int]]
     length: np.ndarray[Any, Any]  # (n,) m
     due: np.ndarray[Any, Any]  # (n,) round in which each may come first
+    orders: Sequence[tuple[str, int, int]] = ()  # edge, the train that passes it first, and the one that comes next
 
 
 def railway(lengths: dict[str, float], links: Sequence[tuple[str, str]], twins: Sequence[tuple[str, str]]) -> Railway:
@@ -109,7 +110,7 @@ def played(plan: Plan, seed: int, reach: float = 300.0, rounds: int = 4000) -> i
     end = ways.begin[ways.first[1:] - 1] + net.length[ways.edge[ways.first[1:] - 1]]
     row, s = ways.first[:-1].copy(), length.copy()
     present, left = np.zeros(n, bool), np.zeros(n, bool)
-    state, idle = interlocking.none(), 0
+    state, idle, orders = interlocking.none(), 0, in_order(plan, ways)
     for step in range(rounds):
         first: dict[int, int] = {}
         for i in np.flatnonzero(~present & ~left & (plan.due <= step)).tolist():
@@ -117,7 +118,8 @@ def played(plan: Plan, seed: int, reach: float = 300.0, rounds: int = 4000) -> i
         entering = np.zeros(n, bool)
         entering[list(first.values())] = True
         state, held, _ = interlocking.request(
-            shared, state, row, s, length, present, np.full(n, reach), CLEARANCE, entering
+            shared, state, row, s, length, present, np.full(n, reach), CLEARANCE, entering,
+            ordered=[o for o in orders if not (left[o.first] or (present[o.first] and row[o.first] >= o.at))],
         )  # fmt: skip
         moved = False
         for e, i in first.items():
@@ -149,6 +151,16 @@ def played(plan: Plan, seed: int, reach: float = 300.0, rounds: int = 4000) -> i
         for i in np.flatnonzero(present)
     }
     raise AssertionError(f"seed {seed}: {np.flatnonzero(~left).tolist()} never arrive: {where}, {state}, {held}")
+
+
+def in_order(plan: Plan, ways: Any) -> list[zones.Ordered]:
+    """The orders of a plan, as rows of ways."""
+    net, found = plan.railway, []
+    for name, first, then in plan.orders:
+        here = {net.number[name], int(net.twin[net.number[name]])}
+        at, row = (int(ways.first[i]) + next(k for k, e in enumerate(plan.paths[i]) if e in here) for i in (first, then))
+        found.append(zones.Ordered(then, row, first, at))
+    return found
 
 
 def _names(plan: Plan) -> list[str]:

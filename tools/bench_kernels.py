@@ -74,6 +74,7 @@ def rows(root: Path, trains: int, repeats: int) -> list[dict[str, Any]]:
             }
             for kind in KINDS
         ]  # fmt: skip
+        print(table(found[-len(KINDS) :]), file=sys.stderr)
     return found
 
 

@@ -1,4 +1,4 @@
-"""A country to run trains in: 44 corridors, one after the other, each with a branch, and a day's timetable.
+"""A country to run trains in: 60 corridors, one after the other, each with a branch, and a day's timetable.
 
 A corridor is a double track with a station every 6 km. A single-track branch with passing loops joins it. The tracks of one
 corridor lead on into those of the next, and some trains run through two or three. Everybody stops; some stops take longer than
@@ -12,7 +12,7 @@ import subprocess
 from pathlib import Path
 
 #: Corridors, their stations, the one where the branch joins, and the passing loops of a branch.
-CORRIDORS, STATIONS, JOINS_AT, LOOPS = 44, 10, 4, 3
+CORRIDORS, STATIONS, JOINS_AT, LOOPS = 60, 7, 3, 3
 APART_M, LINK_M, PIECE_M, LOOP_M = 6000.0, 15_000.0, 5000.0, 1500.0
 
 #: Timetable: speed with which running times are worked out, slack, stop; how often a stop takes longer, and by how much at most.
@@ -21,7 +21,7 @@ OFTEN, LONGER_S = 0.08, 180.0
 
 #: A day, and its trains: per corridor and hour so many of each kind; what is missing to the number asked for runs far.
 DAY_S, RUNS = 86_400.0, 36_000
-LOCAL, BRANCH = 20, 8
+LOCAL, BRANCH = 15, 6
 
 SCENARIO = """schema_version = 1
 title = "A day of a country"
@@ -151,7 +151,7 @@ def timetable(net: Plan, corridors: int, runs: int, day_s: float, seed: int = 1)
         lines = ways[kind]
         for n in range(count):
             line, turn = n % len(lines), n // len(lines)
-            apart = day_s * len(lines) / max(count, 1)
+            apart = day_s / -(-count // len(lines))
             depart = turn * apart + apart * (line * 0.382 % 1.0)
             found.append((round(depart, 1), kind, line, turn))
     found.sort()

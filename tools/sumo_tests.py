@@ -1,11 +1,12 @@
 """A peer's suite: every SUMO configuration of a folder under a law and as the baseline, beside plain SUMO on the same files.
 
 ``python tools/sumo_tests.py FOLDER`` runs each ``*.sumocfg`` below FOLDER three times: by ``sumo`` as it is, by a law (the scenario
-is that of ``trainctl new scenario``) and as the baseline (``law = "sumo"`` on the files as they are). One row each tells
+is that of ``trainctl new scenario``) and as the baseline (``law = "sumo"`` on the files as they are). With ``--obey`` trains also
+run by themselves and obey the signals. One row each tells
 
 =============  ==================================================================================================================
 plain          trains that arrived in plain SUMO; or that SUMO refuses the files
-law, baseline  ok, or the exit code of the run with the first line of what is wrong
+ran            ok, or the exit code of the run with the first line of what is wrong
 arrived        trains that arrived, of those of plain SUMO
 order          whether they arrived in the same order; of those that both have
 stops          stops made, of those of plain SUMO
@@ -15,8 +16,8 @@ named          how many lines ``check`` has of what is not followed
 =============  ==================================================================================================================
 
 The exit code is 1 if a run ends otherwise than with 0, 1 (a bound violated) or 2 (refused in words), if there are more collisions
-than in plain SUMO, or if a stop of plain SUMO is not made. ``--json`` prints the rows as JSON, ``--only WORD`` takes the
-configurations with it in their path, ``--jobs`` runs several at once.
+than in plain SUMO, if a stop of plain SUMO is not made, or if a train that obeys does not arrive. ``--json`` prints the rows as
+JSON, ``--only WORD`` takes the configurations with it in their path, ``--jobs`` runs several at once.
 
 SUMO's own tests come with its source package (``tests/sumo/rail``), not with the wheels; its cases name their files in options, so
 give each a configuration first (``sumo ... --save-configuration run.sumocfg``).
@@ -33,6 +34,7 @@ import sys
 import tempfile
 import tomllib
 from collections import Counter
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,6 +42,10 @@ from typing import Any, NamedTuple
 from sumo_net.build import program
 from trainctl.errors import InputError
 from trainctl.scenario.starter import starter
+
+#: What a scenario is run with, by the names of the rows.
+LAW: dict[str, tuple[str, ...]] = {"law": (), "baseline": ("--set", "controller.law=sumo")}
+OBEY: dict[str, tuple[str, ...]] = {"obey": ("--set", "traffic.cooperate=[]", "--set", "traffic.signals=obey")}
 
 #: No run is waited for longer [s]: in the simulation, and for a run to end.
 END_S, PATIENCE_S = 6000.0, 600.0
@@ -118,8 +124,8 @@ def compared(of: Result, there: Result, begin_s: float) -> dict[str, Any]:
     }
 
 
-def case(sumocfg: Path, base: Path) -> dict[str, Any]:
-    """All rows of one configuration."""
+def case(sumocfg: Path, base: Path, ran: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
+    """All rows of one configuration; ``ran`` is what each is run with."""
     with tempfile.TemporaryDirectory(prefix="sumo_tests.") as name:
         work = Path(name)
         there = plain(sumocfg, work)
@@ -130,22 +136,20 @@ def case(sumocfg: Path, base: Path) -> dict[str, Any]:
             scenario.write_text(starter(sumocfg, work), encoding="utf-8")
         except InputError as error:
             why = str(error).splitlines()[0]
-            return found | {"law": {"ran": f"exit 2: {why}"}, "baseline": {"ran": f"exit 2: {why}"}}
+            return found | {who: {"ran": f"exit 2: {why}"} for who in ran}
         begin = re.search(r'<(?:begin|b) (?:value|v)="([\d.]+)"', sumocfg.read_text(encoding="utf-8"))
         since = float(begin[1]) if begin else 0.0
         end = 1.2 * (max((t for t, _ in there.arrived), default=0.0) - since) + 300.0  # drivers brake with half the deceleration
         if end > tomllib.loads(scenario.read_text(encoding="utf-8"))["run"]["duration_s"]:  # SUMO itself is slower than thought
             longer = re.sub(r"(?m)^duration_s = \d+", f"duration_s = {math.ceil(end)}", scenario.read_text(encoding="utf-8"))
             scenario.write_text(longer, encoding="utf-8")
-        found["law"] = compared(ours(scenario, work / "law"), there, since)
-        found["baseline"] = compared(ours(scenario, work / "baseline", "--set", "controller.law=sumo"), there, since)
-        return found
+        return found | {who: compared(ours(scenario, work / who, *with_), there, since) for who, with_ in ran.items()}
 
 
 def wrong(found: dict[str, Any]) -> list[str]:
     """What of a case must not be."""
     said = []
-    for key in ("law", "baseline"):
+    for key in (who for who in (*LAW, *OBEY) if who in found):
         row = found[key]
         if row["ran"] != "ok":
             said += [f"{found['case']}: {key}: {row['ran']}"] if not row["ran"].startswith("exit 2") else []
@@ -153,6 +157,8 @@ def wrong(found: dict[str, Any]) -> list[str]:
         made, all_of_them = map(int, row["stops"].split("/"))
         said += [f"{found['case']}: {key}: {row['collisions']} more collisions"] if row["collisions"] > 0 else []
         said += [f"{found['case']}: {key}: {all_of_them - made} stops not made"] if made < all_of_them else []
+        here, theirs = map(int, row["arrived"].split("/"))
+        said += [f"{found['case']}: {key}: {theirs - here} trains not arrived"] if key in OBEY and here < theirs else []
     return said
 
 
@@ -161,7 +167,7 @@ def table(found: list[dict[str, Any]]) -> str:
     heads = ("case", "plain", "who", "ran", "arrived", "order", "stops", "late_s", "collisions", "named")
     lines = [heads]
     for row in found:
-        for who in ("law", "baseline"):
+        for who in (who for who in (*LAW, *OBEY) if who in row):
             lines.append(
                 (row["case"], str(row["plain"])[:40], who, *(str(row[who].get(key, ""))[:100] for key in heads[3:]))  # type: ignore[arg-type]
             )
@@ -176,13 +182,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--only", default="", help="configurations with this in their path")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--obey", action="store_true", help="run each with signals obeyed, too")
     given = parser.parse_args(arguments)
     files = sorted(p for p in given.folder.rglob("*.sumocfg") if given.only in str(p))
     if not files:
         print(f"{given.folder}: no *.sumocfg in it", file=sys.stderr)
         return 2
     with ThreadPoolExecutor(given.jobs) as pool:
-        found = list(pool.map(lambda path: case(path.resolve(), given.folder.resolve()), files))
+        ran = LAW | (OBEY if given.obey else {})
+        found = list(pool.map(lambda path: case(path.resolve(), given.folder.resolve(), ran), files))
     print(json.dumps(found, indent=1) if given.json else table(found))
     complaints = [line for row in found for line in wrong(row)]
     print(*complaints, sep="\n", file=sys.stderr)

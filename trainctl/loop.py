@@ -121,7 +121,7 @@ class Loop(Steps):
             world.claim(shown.aspects.claims)
 
         # traffic: departures, stops -> entries; whose turn it is; what is ahead of every train, where it is needed
-        late = self.plant.overrun(own, p.driver_rules.service_mps2)
+        late = self.plant.overrun(own, p.driver_braking)
         going, around = self.traffic.step(t, ways, here, speed, late, s.traffic, red=red)
         for i, v in around.entries:
             own[p.consists.first[i] : p.consists.first[i + 1], SPEED] = v
@@ -177,8 +177,8 @@ class Loop(Steps):
         for turn in around.turns:
             world.turn(*turn)
         world.move(moved.motion.displacement, p.scenario.run.step_s)
-        if world.box is not None and (kept := world.box.kept_parked()):
-            going = self.traffic.kept_parked(kept, going)
+        if world.box is not None and (kept := world.box.kept_parked()):  # they are to ask again
+            going = going._replace(parked=going.parked | np.isin(np.arange(len(going.parked)), kept))
         formed = self.topology.rule.after(formed)
         if around.turns:
             moved, formed = self._turned(t, [turn.train for turn in around.turns], moved, formed, going, watch)
@@ -191,7 +191,7 @@ class Loop(Steps):
         """The last instant, from which no train moves on: no orders, no entries; else sorted, watched and recorded as any other."""
         s, world, t = self.state, self.world, self.time
         own, here, ways = self.measured(s), world.measure(), world.ways
-        late = self.plant.overrun(own, self.p.driver_rules.service_mps2)
+        late = self.plant.overrun(own, self.p.driver_braking)
         speed = own[self.p.leading, SPEED].copy()
         _, red = self.signals.step(t, ways, here, speed, s.traffic, world.box, s.signals)
         going, around = self.traffic.step(t, ways, here, speed, late, s.traffic, last=True, red=red)

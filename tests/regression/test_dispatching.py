@@ -73,6 +73,40 @@ def test_trains_that_would_stand_in_a_circle_are_let_in_one_after_another(tmp_pa
     assert not [e for e in found.events if e["kind"] in ("gridlock", "violation")] and found.ok
 
 
+def kind_of_net(folder: Path, kind: str) -> None:
+    """Two trains of 200 m each way over 4 km, due at once: where simple rules of others let them lock each other."""
+    siding = {"siding": 500.0, "moving block": 500.0, "short siding": 150.0}.get(kind)
+    ends = {"a": (0.0, 0.0), "b": (4000.0, 0.0), "a2": (0.0, -60.0), "b2": (4000.0, -60.0)}
+    if siding is not None:  # single track with two tracks in the middle
+        x, y = 2000.0 - siding / 2.0, 2000.0 + siding / 2.0
+        nodes = ends | {"m": (x, 0.0), "n": (y, 0.0)}
+        tracks = {
+            name: (*between, {"shape": f"{u},0 2000,{side} {v},0"})
+            for name, between, u, v, side in (("up", ("m", "n"), x, y, 10), ("down", ("n", "m"), y, x, -10))
+        }
+        edges = {**nets.both_ways("l", "a", "m"), **nets.both_ways("r", "n", "b"), **tracks}
+        ways = ("l up r", "-r down -l")
+    else:  # a station of two tracks at each end, and one or two tracks between
+        nodes = ends | {"m": (1200.0, 0.0), "n": (2800.0, 0.0)}
+        edges = {"in": ("a", "m"), "out": ("n", "b"), "in2": ("b2", "n"), "out2": ("m", "a2")}
+        if kind == "one way":
+            edges |= nets.both_ways("s", "m", "n")
+        else:
+            edges |= {"s": ("m", "n", {"shape": "1200,0 2000,10 2800,0"}), "-s": ("n", "m", {"shape": "2800,0 2000,-10 1200,0"})}
+        ways = ("in s out", "in2 -s out2")
+    nets.net(folder, nodes, edges)
+    body = "".join(nets.train(f"{way}{n}", ways[way], 0, departPos=250) for way in (0, 1) for n in (1, 2))
+    nets.traffic(folder, body, f'<vType id="emu" vClass="rail" length="200" maxSpeed="{5 if kind == "moving block" else 20}"/>')
+
+
+@pytest.mark.parametrize("kind", ["one way", "two ways", "siding", "moving block", "short siding"])
+def test_no_trains_lock_each_other_in_any_kind_of_net(tmp_path, kind):
+    kind_of_net(tmp_path, kind)
+    found = ran(tmp_path, 3600 if kind == "moving block" else 1400, "numeric", 200.0)
+    assert len(at(found, "arrive")) == 4 and found.ok
+    assert not [e for e in found.events if e["kind"] in ("violation", "gridlock", "waiting")]
+
+
 ORDER = [{"edge": "main", "trains": ["s.0", "s.1", "w.0"]}, {"edge": "main", "trains": ["w.0", "s.2"]}]
 
 
@@ -101,6 +135,41 @@ def test_an_order_on_single_track_is_kept_in_both_directions(tmp_path):
     rows = found.trains.astype({"train": str, "edge": str})
     passing = {name: rows[(rows.train == name) & rows.edge.isin(["middle", "-middle"])].time_s for name in free}
     assert passing["down"].max() < passing["up"].min()
+
+
+@pytest.mark.parametrize(("length", "code"), [(1900.0, 0), (2100.0, 2)])
+def test_orders_by_which_trains_meet_at_a_loop_that_is_too_short_have_no_solution(tmp_path, typed, length, code):
+    """The one going up is to be first before the loop, the other one behind it: 2000 m, of which each needs its length and 30 m."""
+    nets.single_track(tmp_path / "n", nets.train("up", "left up1 middle", 0) + nets.train("down", "-middle down1 -left", 0))
+    made = nets.scenario("robust_constrained", 2000, traffic={"cooperate": []})
+    made["train_type"]["emu"]["unit_length_m"] = length
+    made["order"] = [{"edge": "left", "trains": ["up", "down"]}, {"edge": "middle", "trains": ["down", "up"]}]
+    (tmp_path / "n" / "s.toml").write_text(tomli_w.dumps(made))
+    said = typed("check", tmp_path / "n" / "s.toml")
+    assert said[0] == code
+    if code:
+        assert said[1] == ["s.toml: order: no solution: up, down can never all get out if the orders are kept"]
+        made["event"] = [{"kind": "reroute", "train": "up", "time_s": 100.0, "to_edge": "middle"}]
+        (tmp_path / "n" / "s.toml").write_text(tomli_w.dumps(made))
+        assert typed("check", tmp_path / "n" / "s.toml")[0] == 0
+        notes = open_scenario(str(tmp_path / "n" / "s.toml")).roster.notes
+        assert any("orders say is not decided: trains may be led another way" in note for note in notes)
+        return
+    found = run(open_scenario(str(tmp_path / "n" / "s.toml")), tmp_path / "out", "numeric")
+    assert set(at(found, "arrive")) == {"up", "down"} and found.ok
+
+
+def test_a_train_longer_than_its_loop_is_refused(tmp_path, typed):
+    loop = {"t": (9000, 0), "u": (9300, 400), "v": (9300, -400)}
+    edges = {**nets.both_ways("s", "a", "t"), "tu": ("t", "u"), "uv": ("u", "v"), "vt": ("v", "t")}
+    nets.net(tmp_path / "n", {"a": (0, 0), **loop}, edges)
+    nets.traffic(tmp_path / "n", nets.train("v", "s tu uv vt -s", 0))
+    made = nets.scenario("robust_constrained", 900, traffic={"cooperate": []})
+    for length, code in ((1500.0, 0), (2100.0, 2)):
+        made["train_type"]["emu"]["unit_length_m"] = length
+        (tmp_path / "n" / "s.toml").write_text(tomli_w.dumps(made))
+        said = typed("check", tmp_path / "n" / "s.toml")
+        assert said[0] == code and (not code or "train v: 2100 m long, meets itself on edge" in said[1][0])
 
 
 @pytest.mark.parametrize(

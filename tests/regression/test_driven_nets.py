@@ -101,7 +101,9 @@ def test_everybody_gets_out(tmp_path, seed):
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize(("backend", "seeds"), [("numeric", range(300)), ("sumo", range(300, 330))])
+@pytest.mark.parametrize(
+    ("backend", "seeds"), [*(("numeric", range(k, k + 30)) for k in range(0, 300, 30)), ("sumo", range(300, 330))]
+)
 def test_campaign_three_hundred_nets(tmp_path, backend, seeds):
     for seed in seeds:
         driven(tmp_path / str(seed), seed, backend)

@@ -241,6 +241,15 @@ def test_a_train_does_not_enter_faster_than_a_sign_will_let_it(folder):
     assert events(found, "depart")[0]["speed_mps"] < 8.0
 
 
+def test_a_train_enters_as_fast_as_a_sign_lets_it_at_once_and_later(tmp_path):
+    """Faster than the net has it, where SUMO by itself refuses the train."""
+    nets.net(tmp_path, {"a": (0, 0), "b": (6000, 0), "c": (12000, 0)}, {"ab": ("a", "b", {"speed": 20}), "bc": ("b", "c")})
+    sign = '<variableSpeedSign id="s" lanes="ab_0"><step time="0" speed="35"/></variableSpeedSign>'
+    (tmp_path / "s.add.xml").write_text(f"<additional>{sign}</additional>")
+    found = followed(tmp_path, nets.train("x", "ab bc", 0, departPos=500) + nets.train("y", "ab bc", 60), 70, ADDITIONAL)
+    assert [(e["train"], e["time_s"], e["speed_mps"]) for e in events(found, "depart")] == [("x", 0.0, 34.0), ("y", 60.0, 34.0)]
+
+
 @pytest.mark.parametrize("lots", [1, 2])
 def test_who_finds_no_place_in_a_parking_area_waits_before_it(folder, lots):
     area = f'<parkingArea id="p" lane="bc_0" startPos="500" endPos="1000" roadsideCapacity="{lots}"/>'

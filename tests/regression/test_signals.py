@@ -60,6 +60,7 @@ def join(folder: Path, body: str, signals: str = "wsmx") -> None:
 
 
 WEST, SOUTH = "west0 west main east", "south0 south main east"
+PARKED = '<stop lane="west_0" endPos="1500" duration="10" parking="true"/>'
 
 
 def constraint(signal: str, kind: str, train: str, at: str, foe: str) -> str:
@@ -85,13 +86,17 @@ def test_trains_that_obey_pass_a_join_one_after_the_other_and_are_told_why_they_
         (nets.train("a", WEST, 0) + nets.train("b", SOUTH, 60), constraint("w", "predecessor", "a", "x", "b")),
         (nets.train("a", WEST, 0) + nets.train("b", SOUTH, 60), constraint("w", "insertionPredecessor", "a", "s", "b")),
         (nets.train("a", WEST, 0) + nets.train("b", SOUTH, 60), constraint("w", "insertionOrder", "a", "s", "b")),
+        (nets.train("a", WEST, 0) + nets.train("b", WEST, 60), constraint("w", "insertionPredecessor", "a", "w", "b")),
+        (nets.train("a", WEST, 0) + nets.train("b", WEST, 60), constraint("w", "insertionOrder", "a", "w", "b")),
+        (nets.train("a", WEST, 0, PARKED) + nets.train("b", SOUTH, 200), constraint("m", "insertionPredecessor", "a", "m", "b")),
         (nets.train("a", WEST, 0) + nets.train("b", SOUTH, 200), constraint("m", "foeInsertion", "a", "s", "b")),
         (nets.train("a", WEST, 0, "<param key='tripId' value='first'/>") + nets.train("b", SOUTH, 60),
          constraint("m", "predecessor", "first", "m", "b")),
         (nets.train("up", nets.UP, 0) + nets.train("down", nets.DOWN, 100), constraint("2", "predecessor", "up", "3", "down")),
         (nets.train("up", nets.UP, 0) + nets.train("down", nets.DOWN, 100), constraint("2", "bidiPredecessor", "up", "3", "down")),
     ],
-    ids=["predecessor", "far", "insertionPredecessor", "insertionOrder", "foeInsertion", "trip", "single_track", "bidiPredecessor"],
+    ids=["predecessor", "far", "insertionPredecessor", "insertionOrder", "same_edge", "order_on_same_edge", "parked",
+         "foeInsertion", "trip", "single_track", "bidiPredecessor"],
 )  # fmt: skip
 def test_constraints_are_kept_as_in_plain_sumo(tmp_path, body, said):
     if "west0" in body:
@@ -99,7 +104,7 @@ def test_constraints_are_kept_as_in_plain_sumo(tmp_path, body, said):
     else:
         nets.single_track(tmp_path, body, signals="1234")
     free = {row["id"]: float(row["arrival"]) for row in plain(tmp_path, "tripinfo")}
-    also(tmp_path, said)
+    also(tmp_path, said, '<processing><eager-insert value="true"/></processing>')
     theirs = {row["id"]: float(row["arrival"]) for row in plain(tmp_path, "tripinfo")}
     found = ran(tmp_path, 1150, signals="obey")
     assert order_of(at(found, "arrive")) == order_of(theirs) and len(theirs) == 2 and not amiss(found)
@@ -274,6 +279,47 @@ def test_what_signals_cannot_decide_is_refused(tmp_path, typed, signals, driving
     code, lines = typed("check", tmp_path / "n" / "s.toml")[:2]
     assert code == 2
     assert len(lines) == len(told) and all(part in line for part, line in zip(told, lines, strict=True)), lines
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_formation_holds_together_past_signals_with_moving_block_and_else_it_is_told(tmp_path, moving):
+    nodes = {f"n{k}": (3000.0 * k, 0.0) for k in range(6)}
+    nets.net(tmp_path, nodes, {f"e{k}": (f"n{k}", f"n{k + 1}") for k in range(5)}, signals=[f"n{k}" for k in range(1, 5)])
+    nets.traffic(tmp_path, nets.flow("a", " ".join(f"e{k}" for k in range(5)), 2, 40))
+    also(tmp_path, "", '<processing><railsignal-moving-block value="true"/></processing>' if moving else "")
+    found = ran(tmp_path, 420, signals="obey", cooperate=["*"])
+    rows = (
+        found.trains[(found.trains.time_s > 200.0)]
+        .astype({"train": str})
+        .pivot(index="time_s", columns="train", values="position_m")
+    )
+    assert bool((rows["a.0"] - rows["a.1"]).max() < 1700.0) is moving
+    told = [note for note in open_scenario(str(tmp_path / "s.toml")).roster.notes if "draws formations of the 2 trains" in note]
+    assert len(told) == (0 if moving else 1)
+    assert not amiss(found)
+
+
+@pytest.mark.parametrize(("signals", "taken"), [("wsmx", True), ("sm", False)])
+def test_no_train_is_rerouted_to_where_no_signal_would_hold_it(tmp_path, signals, taken):
+    """A second way leaves at w and joins at x: only a signal at w holds trains before that."""
+    net = {
+        "west0": ("w0", "w"), "west": ("w", "m"), "south0": ("s0", "s"), "south": ("s", "m"), "main": ("m", "x"), "east": ("x", "e"),
+        "over": ("w", "y"), "back": ("y", "v"), "last": ("v", "x"),
+    }  # fmt: skip
+    places = {"w0": (-3000, 0), "w": (0, 0), "s0": (-3000, -3000), "s": (0, -3000), "m": (4000, 0), "x": (6000, 0), "e": (12000, 0),
+              "y": (2000, 900), "v": (4000, 900)}  # fmt: skip
+    nets.net(tmp_path, places, net, signals=signals)
+    nets.traffic(tmp_path, nets.train("a", WEST, 0) + nets.train("b", SOUTH, 60))
+    made = nets.scenario("robust_constrained", 500, traffic={"cooperate": [], "signals": "obey"})
+    made["event"] = [{"kind": "reroute", "train": "a", "time_s": 5.0, "to_edge": "back"}]
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(made))
+    found = run(open_scenario(str(tmp_path / "s.toml")), tmp_path / "out")
+    refused = [e["reason"] for e in found.events if e["kind"] == "reroute_refused"]
+    rows = found.trains.astype({"train": str, "edge": str})
+    assert bool((rows[rows.train == "a"].edge == "back").any()) is taken and not amiss(found)
+    assert refused == (
+        [] if taken else ["signals are obeyed, and on the path to edge back none stands before edge east for train a"]
+    )
 
 
 def test_what_sumo_would_die_of_is_refused_in_its_words(tmp_path, typed):

@@ -263,6 +263,55 @@ def test_signals_let_trains_turn_one_after_the_other_as_in_plain_sumo(net, other
     assert (held or others == "sumo") and all(e["other"] not in (None, e["train"]) for e in held)
 
 
+def stub(folder: Path, signals: str = "ad", number: int = 2) -> None:
+    """A way in over ``a`` and a way out, single track behind them with a signal in ``d``, and a terminal: trains turn there."""
+    nodes = {
+        "i": (-400, 0),
+        "a": (0, 0),
+        "b": (300, 0),
+        "c": (600, 0),
+        "d": (900, 0),
+        "e": (1300, 0),
+        "o": (0, 80),
+        "q": (-400, 80),
+    }
+    track = {key: value for one, two in ("bc", "cd", "de") for key, value in nets.both_ways(one + two, one, two).items()}
+    ways = {"ia": ("i", "a"), "ab": ("a", "b"), "bo": ("b", "o"), "oq": ("o", "q")}
+    nets.net(folder, nodes, track | ways, nets.TERMINALS, signals=signals)
+    way = "ia ab bc cd de -de -cd -bc bo oq"
+    trains = [nets.train(f"t{k}", way, 30 * k, halts("de", duration=10), departSpeed=0) for k in range(number)]
+    nets.traffic(folder, "".join(trains))
+
+
+def test_a_train_that_is_alone_needs_no_signal_before_its_own_way_back(tmp_path):
+    stub(tmp_path, "d", 1)
+    assert opened_in(tmp_path, "robust_constrained", 100, traffic={"signals": "obey", "cooperate": []}).obeys
+    stub(tmp_path, "d", 2)
+    with pytest.raises(InputError, match=r"no rail signal stands before edge :b_.* for train t0 and 1 more"):
+        opened_in(tmp_path, "robust_constrained", 100, traffic={"signals": "obey", "cooperate": []})
+
+
+def test_signals_keep_others_out_of_where_a_train_comes_back_to(tmp_path):
+    """SUMO must know all of its route for that: else the second follows to the inner signal, and both wait for ever."""
+    stub(tmp_path)
+    p = opened_in(tmp_path, "robust_constrained", 700, traffic={"signals": "obey", "cooperate": []})
+    whole = run(p, tmp_path / "out", checkpoint_every_s=100.0)
+    assert [e["train"] for e in told(whole, "arrive")] == ["t0", "t1"] and len(told(whole, "turn")) == 2
+    assert not [e for e in whole.events if e["kind"] in ("violation", "gridlock", "red_passed", "sumo_warning")]
+    held = [e for e in told(whole, "signal") if e["train"] == "t1"]
+    assert {(e["signal"], e["other"]) for e in held} == {("a", "t0")}
+    theirs = {row["id"]: float(row["arrival"]) for row in plain(tmp_path, "tripinfo")}
+    assert sorted(theirs, key=theirs.__getitem__) == ["t0", "t1"]
+    with pytest.raises(KeyboardInterrupt), opened(p, tmp_path / "cut", checkpoint_every_s=100.0) as sim:
+        while sim.time < told(whole, "turn")[1]["time_s"] + 20.0:
+            sim.step()
+        raise KeyboardInterrupt
+    again, since = resume(tmp_path / "cut")
+    assert since is not None and since > told(whole, "turn")[0]["time_s"]
+    for name in ("trains.parquet", "events.jsonl", "metrics.json"):
+        assert (whole.folder / name).read_bytes() == (again.folder / name).read_bytes(), name
+
+
 def test_a_train_with_its_rear_inside_a_junction_goes_on_before_it_turns(tmp_path):
     stop = '<stop lane="bc_0" endPos="98" duration="10"/>'
     nets.terminals(tmp_path, nets.train("v", "ab bc -bc -ab", 0, stop), scale=0.25)

@@ -98,6 +98,16 @@ def judge(
 
 
 @njit(cache=True)
+def cut(actions: Floats, limit: float, out: Floats) -> int:
+    """Write ``actions`` (N,) into ``out``, cut off at plus and minus ``limit``; the first one that is not finite, -1: all are."""
+    for i in range(len(actions)):
+        if not abs(actions[i]) < np.inf:
+            return i
+        out[i] = min(max(actions[i], -limit), limit)
+    return -1
+
+
+@njit(cache=True)
 def touch(position: Floats, ahead: Ints, length: Floats, run: Ints, over: Bools) -> None:
     """Write into ``over`` (R,) in which runs a train has touched the one ahead of it in its formation (N,), or is lost."""
     for i in range(len(position)):

@@ -16,7 +16,7 @@ import numpy as np
 from trainctl import runner
 from trainctl.ensemble.stack import alone, stacked
 from trainctl.ensemble.steps import Abreast
-from trainctl.environment.agents import Judged, columns, judge, seen, touch
+from trainctl.environment.agents import Judged, columns, cut, judge, seen, touch
 from trainctl.errors import InputError
 from trainctl.loop import Loop
 from trainctl.plants import disturbance
@@ -139,7 +139,7 @@ class Ensemble:
         s, a = self.state, self.abreast
         t = s.k * a.p.scenario.run.step_s
         acting = disturbance.at(a.stack.signals, s.k, t, s.position)
-        believed = a.plant.believed_resistance(s.own)
+        believed = a.plant.believed_resistance
         exchanged = a.control.exchanged(s.k, t, s.own, believed, s.formed, s.messages, s.memory, acting)
         return Now(exchanged, s.position, a.p.speeds(s.own), a.stack.links, a.left(s))
 
@@ -212,7 +212,7 @@ class Railway:
             links = p.first_links
             formed = formed._replace(links=links, constants=p.law.constants(p.params, p.scene(own, links, t)))
         acting = disturbance.at(loop.disturbances, s.k, t, position)
-        believed = loop.plant.believed_resistance(own)
+        believed = loop.plant.believed_resistance
         exchanged = loop.control.exchanged(s.k, t, own, believed, formed, s.messages, s.memory, acting)
         return Now(exchanged, position, p.speeds(own), links, ~loop.world.measure().present)
 
@@ -287,11 +287,9 @@ class Agents:
 
         Of agents that were terminated before, everything is 0 from then on, and they stay terminated.
         """
-        if not np.isfinite(actions).all():
-            i = int(np.flatnonzero(~np.isfinite(actions))[0])
-            raise InputError(f"action of agent {self.names[i]} = {actions[i]}: must be finite")
-        limit, course = self.asked.limit_mps2, self.course
-        given = np.minimum(np.maximum(actions, -limit), limit)
+        course, given = self.course, np.empty(len(self.names))
+        if (wrong := cut(actions, self.asked.limit_mps2, given)) >= 0:
+            raise InputError(f"action of agent {self.names[wrong]} = {actions[wrong]}: must be finite")
         course.go_on(*((given, None) if self.asked.acts == "acceleration" else (None, given)))
         now = course.now()
         n = len(now.speed)

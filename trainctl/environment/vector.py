@@ -105,7 +105,7 @@ class VectorTrains(VectorEnv[Observations, Observations, NDArray[Any]]):
         if given.shape != (self.num_envs, 1):
             raise InputError(f"actions: shape {given.shape}: must be {(self.num_envs, 1)}")
         done = self.agents.step(given[:, 0])
-        self.goes_on = not (done.truncated | done.terminated).all()
+        self.goes_on = not (self.agents.course.done or done.terminated.all())
         return done.seen.astype(np.float32), done.reward, done.terminated, done.truncated, done.judged._asdict()
 
     def close_extras(self, **kwargs: Any) -> None:

@@ -13,6 +13,7 @@ from trainctl.railway.along import Ahead
 from trainctl.railway.bodies import Bodies, bodies, fouling
 from trainctl.railway.supervisor import LIMIT, OPPOSING, SWITCH, TRAIN, Assumed, Limits, Params, Targets, Verdict, verdict
 from trainctl.railway.ways import Ways
+from trainctl.railway.zones import short_of_junctions
 from trainctl.signals import Bools, Floats, Ints
 
 keep_by_sources()  # before anything below is decorated
@@ -36,7 +37,7 @@ class View(NamedTuple):
 
 def look(
     ways: Ways, net: along.Net, limit: Floats, falls: Bools, factor: Floats, row: Ints, s: Floats, speed: Floats, length: Floats,
-    present: Bools, horizon: float, held: Floats, order: along.Order | None, at: int = SWITCH,
+    present: Bools, horizon: float, held: Floats, order: along.Order | None, internal: Bools, at: int = SWITCH,
 ) -> View:  # fmt: skip
     """Look ahead along the ways of all trains.
 
@@ -60,6 +61,8 @@ def look(
         How far every front may go because what comes then is another train's turn [m]; inf: as far as it likes.
     order : Order, optional
         Turns that are decided, see ``interlocking.order``.
+    internal : ndarray of bool, shape (E,)
+        Edges inside junctions: whoever keeps a join clear stands before its junction.
     at : int
         What trains are held at: place in ``supervisor.KINDS``.
 
@@ -69,7 +72,7 @@ def look(
         Targets are the bodies ahead and the places where trains are held, limits those of the edges under every train and ahead.
     """
     placed = along.places(ways, net, row, s, length, present, horizon, order)
-    there = bodies(placed, virtual=False)
+    there = _short(bodies(placed, virtual=False), ways, net, internal, row, s)
     clear = _targets(there, held, speed, present, at)
     targets = _targets(bodies(placed), held, speed, present, at) if len(placed.join_train) else clear
     room, body = np.full(len(row), np.inf), np.full(len(row), -1, np.int64)
@@ -78,6 +81,15 @@ def look(
     room[there.train[real]], body[there.train[real]] = there.room[real], there.other[real]  # the nearest is written last
     limits = Limits(*_limits(ways, limit, falls, factor, row, s, length, present, horizon))
     return View(along.ahead(placed), targets, clear, limits, room, body, fouling(placed))
+
+
+def _short(there: Bodies, ways: Ways, net: along.Net, internal: Bools, row: Ints, s: Floats) -> Bodies:
+    """Bodies with the room to what is to be kept clear, but not onto its junction."""
+    if not internal.any() or not (clear := there.sense == 0).any():
+        return there
+    room = there.room.copy()
+    room[clear] = short_of_junctions(ways, net, internal, there.train[clear], row, s, room[clear])
+    return there._replace(room=room)
 
 
 def _targets(body: Bodies, held: Floats, speed: Floats, present: Bools, at: int) -> Targets:

@@ -9,6 +9,9 @@ others, itself. A stretch is granted, and a train let into the net, only if it d
 A train that turns stands at the end of its way, and needs besides those that may stand where it runs back: on its next leg, on the
 twin of that or across, but for those ahead of it that it turns its rear to.
 
+Orders are needs as well: who must let another train pass first needs that until it comes to a stand beyond the place only. They can
+forbid every way out, which is looked for before a run (``solvable``); what the rule then grants is free of circles all the same.
+
 Circles of joins alone, without single track or crossings, are not looked at (a roundabout that is full): those are told, see
 ``monitors.waiting``.
 
@@ -49,6 +52,7 @@ class Standing(NamedTuple):
     row: Ints
     rear: Floats  # (n,) m, of every train now
     on: Mapping[int, Sequence[tuple[int, int, float]]]  # edge: trains that stand on it, its row in their ways, and their rears [m]
+    near: Bools  # (E,) edges on which, on whose twins or across which trains stand
     before: Mapping[int, Sequence[int]]  # train: those that go before it where it stands
     back: Mapping[int, Sequence[int]]  # train that turns: the edges it runs over then
 
@@ -77,7 +81,7 @@ def standing(
         Of trains that turn at the end of their ways: the edges they run over then.
     """
     on: dict[int, list[tuple[int, int, float]]] = {}
-    before: dict[int, list[int]] = {i: [] for i in limits}
+    before: dict[int, list[int]] = {}
     stood: Bools = np.zeros(len(net.length), bool)  # edges in ``on``
 
     def stands(i: int, front: float, k: int, room: float) -> list[int]:
@@ -106,19 +110,19 @@ def standing(
         trains.sort(key=lambda i: (ways.begin[limits[i]] - s[i], i))
         behind = 0.0
         for place, i in enumerate(trains):
-            before[i] += trains[:place]
+            before.setdefault(i, []).extend(trains[:place])
             behind += length[i]
             stands(i, float(ways.begin[limits[i]]), limits[i], behind)
             behind += clearance
-    for i, k in limits.items():
+    for i, k in limits.items() if back else ():
         if k < 0 and i in back:
             last = int(ways.first[i + 1]) - 1
             stands(i, float(ways.begin[last] + net.length[ways.edge[last]]), last, float(length[i]))
     for i, k, others in turns:
         if others:
-            before[i] += others
+            before.setdefault(i, []).extend(others)
             stands(i, float(ways.begin[k]), k, float(length[i]))
-    here, known, fresh = Standing(ways, net, row, s - length, on, before, back), set[tuple[int, int]](), True
+    known, fresh = set[tuple[int, int]](), True
     train, rows = _to_pass(ways, row, limits)
     edges = ways.edge[rows]
     while fresh:
@@ -128,14 +132,16 @@ def standing(
             place = heappop(places)
             i, k = int(train[place]), int(rows[place])
             for j, m, rear in tuple(on[int(edges[place])]):
-                if j != i and (i, j) not in known and i not in before[j] and goes_before(j, m, i, k):
+                if j != i and (i, j) not in known and i not in before.get(j, ()) and goes_before(j, m, i, k):
                     known.add((i, j))
                     fresh = True
                     new = stands(i, float(ways.begin[k] + max(rear - ways.begin[m], 0.0) - clearance), k, float(length[i]))
                     for e in new:
                         for more in np.flatnonzero(edges[place + 1 :] == e).tolist():
                             heappush(places, place + 1 + more)
-    return here
+    near = stood | (net.twin >= 0) & stood[net.twin]
+    near[np.repeat(np.arange(len(stood)), np.diff(net.cross_first))[stood[net.cross]]] = True
+    return Standing(ways, net, row, s - length, on, near, before, back)
 
 
 def _to_pass(ways: Ways, row: Ints, limits: Mapping[int, int]) -> tuple[Ints, Ints]:
@@ -147,23 +153,33 @@ def _to_pass(ways: Ways, row: Ints, limits: Mapping[int, int]) -> tuple[Ints, In
     return np.repeat(trains, count), np.arange(len(skipped)) + skipped
 
 
+def rears(here: Standing) -> dict[int, float]:
+    """How far back the rear of every train may come to stand [m]; who runs on to the end of its way is not in it."""
+    found: dict[int, float] = {}
+    for trains in here.on.values():
+        for i, _, rear in trains:
+            found[i] = min(rear, found.get(i, rear))
+    return found
+
+
 def needs(here: Standing, i: int, goes_before: Before) -> Iterable[int]:
     """Trains that must have gone before ``i`` can leave."""
-    ways = here.ways
+    ways, row = here.ways, int(here.row[i])
     yield from here.before.get(i, ())
-    for k in range(int(here.row[i]), int(ways.first[i + 1])):
+    for k in (row + np.flatnonzero(here.near[ways.edge[row : ways.first[i + 1]]])).tolist():  # few are, of long ways
         yield from against(here, i, k)
         for j, m, _ in here.on.get(int(ways.edge[k]), ()):
-            if j != i and i not in here.before[j] and goes_before(j, m, i, k):
+            if j != i and i not in here.before.get(j, ()) and goes_before(j, m, i, k):
                 yield j
-    yield from _behind(here, i, goes_before)
+    if i in here.back:
+        yield from _behind(here, i, goes_before)
 
 
 def _behind(here: Standing, i: int, goes_before: Before) -> Iterable[int]:
     """Trains that must have gone before ``i`` can run back once it has turned."""
     net, ways = here.net, here.ways
     rows = {int(ways.edge[k]): k for k in range(int(ways.first[i]), int(ways.first[i + 1]))}
-    for e in here.back.get(i, ()):
+    for e in here.back[i]:
         yield from (j for j, _, _ in here.on.get(e, ()) if j != i)
         for f in (int(net.twin[e]), *net.cross[net.cross_first[e] : net.cross_first[e + 1]].tolist()):
             for j, m, _ in here.on.get(f, ()):

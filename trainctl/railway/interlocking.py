@@ -20,7 +20,7 @@ import numpy as np
 
 from trainctl.railway import deadlock
 from trainctl.railway.along import Order
-from trainctl.railway.zones import Index, Trains, Zones, coming, near, under
+from trainctl.railway.zones import Index, Ordered, Trains, Zones, coming, in_place_of, near
 from trainctl.signals import Bools, Floats, Ints
 
 #: A train this near to its own stop is at it [m].
@@ -67,7 +67,7 @@ def order(state: State) -> Order:
 def request(
     zones: Zones, state: State, row: Ints, s: Floats, length: Floats, present: Bools, reach: Floats,
     clearance: float = 0.0, entering: Bools | None = None, stop: Floats | None = None, stands: Bools | None = None,
-    ordered: Sequence[tuple[int, int, int]] = (), keeps: Bools | None = None, back: Mapping[int, Sequence[int]] = deadlock.NOBODY,
+    ordered: Sequence[Ordered] = (), keeps: Bools | None = None, back: Mapping[int, Sequence[int]] = deadlock.NOBODY,
 ) -> tuple[State, Held, list[Decision]]:  # fmt: skip
     """Requests of all trains at one instant.
 
@@ -90,7 +90,7 @@ def request(
     stands : ndarray, shape (n,), optional
         Trains that stand there and are not to go on yet.
     ordered : sequence of tuple
-        Train, a row of its way, and the train that must have passed there first.
+        Trains that must leave a place to another one first.
     keeps : ndarray, shape (n,), optional
         Of those that ask to enter, who keeps its place at joins; default all.
     back : mapping, optional
@@ -130,7 +130,7 @@ def request(
         (joins if is_join else stretches).setdefault((i, int(edge[k])), k)
     trains = Trains(zones, row, s, length, *coming(zones, row, present))
     shut: dict[int, tuple[int, int]] = {}  # first row that a train must leave to another one, and that
-    for i, k, first in ordered:
+    for i, k, first, _ in ordered:
         shut[i] = min((k, first), shut.get(i, (k, first)))
     for i, (k, first) in list(shut.items()):  # those behind it on its track wait with it
         for (j, e), m in joins.items():
@@ -147,7 +147,8 @@ def request(
     leave = {(i, e): g for i, e, g in state["stretches"]}
     said = _turns(trains, queues, joins, _open(_inside(joins, outside), stretches, leave), outside)
     order, granted = _queue(trains, state["stretches"], stretches, queues)
-    in_place = _in_place(trains, present, np.flatnonzero(outside).tolist(), clearance)
+    order = _let_by(trains, order, stretches, np.flatnonzero(outside).tolist(), present, clearance)
+    in_place = in_place_of(trains, present, np.flatnonzero(outside).tolist(), clearance)
     granted |= {key: False for key in order if outside[key[0]]}  # it has its place in the queue only
     own = _by_train(stretches), _by_train(joins)
     for i in np.flatnonzero(stands & present).tolist():
@@ -175,6 +176,7 @@ def request(
     room, zone, by = np.full(len(row), np.inf), np.full(len(row), -1, np.int64), np.full(len(row), -1, np.int64)
     behind: dict[int, int] = {}
     there = present.copy()  # and whoever is let in
+    here: deadlock.Standing | None = None  # where trains on the net may come to stand, as long as nothing more is granted
     for key in list(order):
         i, e = key
         k = stretches[key]
@@ -196,17 +198,19 @@ def request(
             if blocker < 0:
                 blocker = later if later >= 0 else waiting.blocker(i, rest)
             if blocker >= 0 and later < 0:
-                here = _standing(trains, there, granted, i, (), clearance, queues, joins, ordered, back)
+                if here is None or not there[i]:
+                    here = _standing(trains, there, granted, i, (), clearance, queues, joins, ordered, back)
                 stuck_itself = any(True for _ in deadlock.needs(here, blocker, trains.before(queues)))
                 if not (stuck_itself or _stood_on(here, zones.ends, i, [k, *rest])):
                     waiting.add(i, [k, *rest])
+                here = here if there[i] else None
             if blocker < 0 and outside[i]:  # no train comes in before one that waits for the same, whatever for
                 blocker = stuck.blocker(i, [k, *rest])
             if blocker < 0 and i in shut and rest and shut[i][0] <= zones.ends[rest[-1]]:
                 blocker = shut[i][1]
             if blocker < 0:
-                here = _standing(trains, there, granted, i, [k, *rest], clearance, queues, joins, ordered, back)
-                blocker = deadlock.in_a_circle(here, i, trains.before(queues))
+                with_it = _standing(trains, there, granted, i, [k, *rest], clearance, queues, joins, ordered, back)
+                blocker = deadlock.in_a_circle(with_it, i, trains.before(queues))
         if blocker >= 0:
             stuck.add(i, [k, *rest])
             behind.setdefault(e, i)
@@ -215,7 +219,7 @@ def request(
             if begin[k] - s[i] < room[i]:
                 room[i], zone[i], by[i] = max(begin[k] - s[i], 0.0), e, blocker
             continue
-        there[i] = True
+        there[i], here = True, None
         held.add(i, [k, *rest])
         for r in [k, *rest]:
             one = (i, int(edge[r]))
@@ -293,7 +297,7 @@ def _by_train(requests: Iterable[tuple[int, int]]) -> dict[int, list[tuple[int, 
 
 def _gives_back(
     trains: Trains, present: Bools, granted: dict[tuple[int, int], bool], own: Iterable[tuple[int, int]], i: int, clearance: float,
-    queues: dict[int, list[int]], joins: dict[tuple[int, int], int], ordered: Sequence[tuple[int, int, int]],
+    queues: dict[int, list[int]], joins: dict[tuple[int, int], int], ordered: Sequence[Ordered],
     back: Mapping[int, Sequence[int]],
 ) -> bool:  # fmt: skip
     """Whether all can still get out if ``i``, whose requests of stretches are its ``own``, does without what lies ahead of it."""
@@ -342,7 +346,7 @@ def _limit(trains: Trains, granted: dict[tuple[int, int], bool], i: int, more: C
 
 def _standing(
     trains: Trains, on: Bools, granted: dict[tuple[int, int], bool], i: int, rows: Sequence[int], clearance: float,
-    queues: dict[int, list[int]], joins: dict[tuple[int, int], int], ordered: Sequence[tuple[int, int, int]],
+    queues: dict[int, list[int]], joins: dict[tuple[int, int], int], ordered: Sequence[Ordered],
     back: Mapping[int, Sequence[int]],
 ) -> deadlock.Standing:  # fmt: skip
     """Where all may come to stand if ``i`` gets the stretches at these rows."""
@@ -359,10 +363,22 @@ def _standing(
     ]
     new = [r for r in _joining(trains, i, rows[0], int(zones.ends[rows[-1]])) if (i, int(edge[r])) not in joins] if rows else []
     turns += [(i, r, [m for m in queues.get(int(edge[r]), ()) if m in limits]) for r in new]  # it would come last
-    turns += [(j, k, [first]) for j, k, first in ordered if j in limits]
-    return deadlock.standing(
-        zones.ways, zones.net, trains.row, trains.s, trains.length, clearance, limits, turns, trains.before(queues), back
-    )
+
+    def stands(orders: Sequence[Ordered]) -> deadlock.Standing:
+        # Who waits before a place in a stretch does not enter that.
+        more = [(j, b if (b := int(zones.begins[k])) > trains.row[j] else k, [first]) for j, k, first, _ in orders]
+        return deadlock.standing(
+            zones.ways, zones.net, trains.row, trains.s, trains.length, clearance, limits, [*turns, *more], trains.before(queues),
+            back,
+        )  # fmt: skip
+
+    orders = [one for one in ordered if one.train in limits]
+    here = stands(orders)
+    if not orders:
+        return here
+    rear = deadlock.rears(here)  # who comes to a stand beyond the place only has passed it by then
+    left = [o for o in orders if o.first not in limits or rear.get(o.first, np.inf) + trains.length[o.first] <= begin[o.at] + AT_M]
+    return here if len(left) == len(orders) else stands(left)
 
 
 def _joining(trains: Trains, i: int, k: int, last: int) -> list[int]:
@@ -375,23 +391,6 @@ def _joining(trains: Trains, i: int, k: int, last: int) -> list[int]:
 def _stood_on(here: deadlock.Standing, ends: Ints, i: int, rows: Iterable[int]) -> bool:
     """Whether another may come to stand where it shuts the stretches at these rows to ``i``: they do not clear by themselves."""
     return any(True for k in rows for r in range(k, ends[k] + 1) for _ in deadlock.against(here, i, r))
-
-
-def _in_place(trains: Trains, present: Bools, outside: list[int], clearance: float) -> dict[int, int]:
-    """Trains that are to enter where another one is: which."""
-    ways, row, s, length = trains.zones.ways, trains.row, trains.s, trains.length
-    on: dict[int, list[tuple[int, float]]] = {}
-    for j in np.flatnonzero(present).tolist() if outside else ():
-        for k in under(ways, row, s, length, j):
-            on.setdefault(int(ways.edge[k]), []).append((j, s[j] - ways.begin[k]))
-    found = {}
-    for i in outside:
-        for k in under(ways, row, s, length, i):
-            depth = s[i] - ways.begin[k]
-            for j, other in on.get(int(ways.edge[k]), ()):
-                if other - length[j] < depth + clearance and other > depth - length[i]:
-                    found[i] = j
-    return found
 
 
 def _open(
@@ -442,6 +441,23 @@ def _queue(
         queue.insert(turn, i)
         granted[i, e] = False
     return order, granted
+
+
+def _let_by(
+    trains: Trains, order: list[tuple[int, int]], near: dict[tuple[int, int], int], outside: list[int], present: Bools,
+    clearance: float,
+) -> list[tuple[int, int]]:  # fmt: skip
+    """The order with who is ``outside`` behind those on its track that are not behind its place: it waits until they are by."""
+    for i, e in [key for key in order if key[0] in outside]:
+        k, rest = near[i, e], [key for key in order if key != (i, e)]
+        rear = trains.distance(i, k) + trains.length[i] + clearance
+        there = [
+            at for at, (j, f) in enumerate(rest)
+            if f == e and present[j] and trains.track(j, near[j, e]) == trains.track(i, k) and trains.distance(j, near[j, e]) < rear
+        ]  # fmt: skip
+        if there and there[-1] >= order.index((i, e)):
+            order = [*rest[: there[-1] + 1], (i, e), *rest[there[-1] + 1 :]]
+    return order
 
 
 def _lead(leading: dict[int, set[int]], zones: Zones, i: int, k: int) -> None:

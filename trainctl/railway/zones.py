@@ -44,8 +44,8 @@ def of(ways: Ways, net: Net, later: Sequence[int] | Ints = ()) -> Zones:
     return Zones(ways, net, *_stretches(ways, shared))
 
 
-def short_of_junctions(ways: Ways, net: Net, internal: Bools, row: Ints, s: Floats, room: Floats) -> Floats:
-    """Room (n,) [m] up to what trains must not enter yet, but not onto a junction on which another track comes in beside theirs.
+def short_of_junctions(ways: Ways, net: Net, internal: Bools, train: Ints, row: Ints, s: Floats, room: Floats) -> Floats:
+    """Room (k,) [m] up to what trains must not enter yet, but not onto a junction on which another track comes in beside theirs.
 
     Parameters
     ----------
@@ -53,24 +53,36 @@ def short_of_junctions(ways: Ways, net: Net, internal: Bools, row: Ints, s: Floa
         Of all trains.
     internal : ndarray of bool, shape (E,)
         Edges inside junctions.
-    row, s, room : ndarray, shape (n,)
-        Where the fronts are, and the room from there to the beginning of an edge [m]; inf: none.
+    row, s : ndarray, shape (n,)
+        Where the fronts are.
+    train, room : ndarray, shape (k,)
+        Trains, and the room from their fronts to the beginning of an edge [m]; inf: none.
     """
     found = room.copy()
-    for i in np.flatnonzero(np.isfinite(room) & (room > 0.0)).tolist():
+    for q in np.flatnonzero(np.isfinite(room) & (room > 0.0)).tolist():
+        i = int(train[q])
         a, b = int(row[i]), int(ways.first[i + 1])
-        k = a + int(np.searchsorted(ways.begin[a:b], s[i] + room[i] - TOUCH_M))
+        k = a + int(np.searchsorted(ways.begin[a:b], s[i] + room[q] - TOUCH_M))
         if k < b and net.joins[ways.edge[k]]:
             while k > a and internal[ways.edge[k - 1]]:
                 k -= 1
-            found[i] = max(ways.begin[k] - s[i], 0.0)
+            found[q] = max(ways.begin[k] - s[i], 0.0)
     return found
+
+
+class Ordered(NamedTuple):
+    """A train that must not enter row ``row`` of its way before another one has entered row ``at`` of its own."""
+
+    train: int
+    row: int
+    first: int
+    at: int
 
 
 def passes_first(
     pairs: Iterable[tuple[int, int, int]], net: Net, ways: Ways, row: Ints, came: Bools, never: Bools
-) -> list[tuple[int, int, int]]:  # fmt: skip
-    """Trains that must let another one pass an edge first: train, row of the edge in its way, the other one.
+) -> list[Ordered]:  # fmt: skip
+    """Trains that must let another one pass an edge first.
 
     Parameters
     ----------
@@ -90,7 +102,7 @@ def passes_first(
         if not all(map(len, rows)) or never[first]:
             continue
         if not (came[first] and row[first] >= rows[0][0]) and not (came[then] and row[then] >= rows[1][0]):
-            found.append((then, int(rows[1][0]), first))
+            found.append(Ordered(then, int(rows[1][0]), first, int(rows[0][0])))
     return found
 
 
@@ -185,6 +197,23 @@ def under(ways: Ways, row: Ints, s: Floats, length: Floats, i: int) -> Iterable[
     while k > ways.first[i] and ways.begin[k] > s[i] - length[i]:
         k -= 1
         yield k
+
+
+def in_place_of(trains: Trains, present: Bools, outside: list[int], clearance: float) -> dict[int, int]:
+    """Trains that are to enter where another one is: which."""
+    ways, row, s, length = trains.zones.ways, trains.row, trains.s, trains.length
+    on: dict[int, list[tuple[int, float]]] = {}
+    for j in np.flatnonzero(present).tolist() if outside else ():
+        for k in under(ways, row, s, length, j):
+            on.setdefault(int(ways.edge[k]), []).append((j, s[j] - ways.begin[k]))
+    found = {}
+    for i in outside:
+        for k in under(ways, row, s, length, i):
+            depth = s[i] - ways.begin[k]
+            for j, other in on.get(int(ways.edge[k]), ()):
+                if other - length[j] < depth + clearance and other > depth - length[i]:
+                    found[i] = j
+    return found
 
 
 @njit(cache=True)

@@ -13,10 +13,14 @@ from typing import Literal
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
+import numpy as np
+
 from sumo_net import Rails
+from trainctl.railway.ways import Ways
 from trainctl.scenario.events import Order
 from trainctl.scenario.tables import TrafficTable
 from trainctl.signals import Bools, Ints
+from trainctl.traffic.handed import Handed
 from trainctl.traffic.rail_signals import Signal
 
 #: More edges than this are counted, not named.
@@ -63,22 +67,34 @@ def chosen(
     return "obey", [f"traffic.signals = obey: chosen since {why}{other}"], []
 
 
+def of_formations(together: Bools, options: Mapping[str, str]) -> list[str]:
+    """What signals do to formations of trains that cooperate (n,), where they are obeyed; ``options`` are those of the files."""
+    if together.sum() < 2 or options.get("railsignal-moving-block", "false").lower() in ("true", "1", "yes", "on"):
+        return []
+    return [
+        f"traffic.signals = obey: a signal lets one train at a time into its block, so it draws formations of the {together.sum()}"
+        " trains that cooperate apart; SUMO's option railsignal-moving-block lets them pass together"
+    ]
+
+
 def unguarded(ways: Sequence[Ints], ids: Sequence[str], rails: Rails, signals: Sequence[Signal]) -> list[str]:
     """Joins and single track that two trains use, and that some train comes to without a rail signal before it.
 
     A train that begins there needs none: SUMO does not let it in before the place is free.
     """
     stands = {(rails.index.get(s.edge, -1), rails.index.get(s.onward, -1)) for s in signals}
-    users: dict[int, int] = {}
+    users: dict[int, set[int]] = {}
     over: dict[int, set[int]] = {}  # edges that lead into each, as far as trains come over them
-    for way in ways:
+    for i, way in enumerate(ways):
         for edge in set(way.tolist()):
-            users[edge] = users.get(edge, 0) + 1
+            users.setdefault(edge, set()).add(i)
         for a, b in zip(way[:-1].tolist(), way[1:].tolist(), strict=True):
             over.setdefault(b, set()).add(a)
     single = {
-        e for e in users if any(other in users for other in (int(rails.twin[e]), *rails.crossing[e]) if other >= 0)
-    }  # fmt: skip
+        e
+        for e in users
+        if any(len(users[e] | users[other]) > 1 for other in (int(rails.twin[e]), *rails.crossing[e]) if other in users)
+    }
     found: dict[int, list[str]] = {}
     for name, way in zip(ids, ways, strict=True):
         guarded, last = False, int(way[0])
@@ -88,12 +104,21 @@ def unguarded(ways: Sequence[Ints], ids: Sequence[str], rails: Rails, signals: S
                 onward = next((e for e in way[k:].tolist() if not rails.internal[e]), -1)
                 guarded = not rails.internal[last] and (last, onward) in stands
             begun &= edge in single
-            shared = (k > 0 and len(over[edge]) > 1) or edge in single
+            shared = (k > 0 and len(over[edge]) > 1 and len(users[edge]) > 1) or edge in single
             if shared and not guarded and not begun and k > 0:
                 found.setdefault(edge, []).append(name)
             last = edge
     named = [f"before edge {rails.edges[e]} for train {_some(trains)}" for e, trains in found.items()]
     return named if len(named) <= MOST else [*named[:MOST], f"before {len(named) - MOST} more edges"]
+
+
+def without_signal(
+    ways: Ways, i: int, row: int, edges: Sequence[int] | Ints, ids: Sequence[str], rails: Rails, signals: Sequence[Signal]
+) -> str:
+    """A place that two trains may want and that has no signal before it if ``i`` runs over ``edges`` from ``row`` on; "": none."""
+    all_of_them = [ways.edge[a:b] for a, b in pairwise(ways.first.tolist())]
+    all_of_them[i] = np.concatenate([ways.edge[ways.first[i] : row], np.asarray(edges, np.int64)])
+    return next(iter(unguarded(all_of_them, ids, rails, signals)), "")
 
 
 def constraints(
@@ -149,6 +174,19 @@ def unkept(elements: Sequence[Element], signals: Sequence[Signal], trips: Collec
             if foes and one.get("tripId") in trips:
                 notes.append(f"{who}: {one.tag}: {', '.join(foes)}: no such train: {one.get('tripId')} waits for it for ever")
     return wrong, notes
+
+
+def yielding(handed: Handed | None, edge: Ints) -> set[int]:
+    """Trains that constraints keep out of the net until another one has come over the same edge; ``edge`` (n,): where they come."""
+    if handed is None:
+        return set()
+    number = {trip: i for i, trip in enumerate(handed.trips)}
+    found = set()
+    for element in map(ElementTree.fromstring, handed.additional):
+        for one in (one for one in element if one.tag in ("insertionPredecessor", "insertionOrder")):
+            i, foes = number.get(one.get("tripId", ""), -1), [number[f] for f in one.get("foes", "").split() if f in number]
+            found |= {i for j in foes if i >= 0 and edge[i] == edge[j]}
+    return found
 
 
 def _before(route: Sequence[str], edges: Collection[str], rails: Rails, at: Mapping[tuple[str, str], str]) -> str | None:

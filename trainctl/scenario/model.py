@@ -194,19 +194,37 @@ class Model:
         return self.scenario.traffic or TrafficTable()
 
     @cached_property
+    def driver_acceleration(self) -> Floats:
+        """With which a driver accelerates every train [m/s2], shape (n,)."""
+        return self._driven_with("driven_acceleration_mps2", self.driving.acceleration_mps2)
+
+    @cached_property
+    def driver_braking(self) -> Floats:
+        """With which a driver brakes every train [m/s2], shape (n,)."""
+        return np.minimum(
+            self._driven_with("driven_deceleration_mps2", self.driving.deceleration_mps2), self.supervision.emergency_mps2
+        )
+
+    def _driven_with(self, key: str, usual: float) -> Floats:
+        """A key of the types of all trains, shape (n,), ``usual`` where it is not stated."""
+        said = {name: getattr(kind, key) for name, kind in self.scenario.train_type.items()}
+        own = [said[t.type] for t in self.scenario.train]
+        return np.array([usual if value is None else value for value in own], float)
+
+    @cached_property
     def driver_rules(self) -> supervisor.Params:
         """By what a driver judges: he brakes as planned and keeps farther away, so that the supervisor has nothing to do."""
         rules = self.supervision
-        rate = min(self.driving.deceleration_mps2, rules.emergency_mps2)
+        rate, pull = float(self.driver_braking.max()), float(self.driver_acceleration.max())
         return rules.model_copy(update={
-            "mode": "on", "emergency_mps2": rate, "service_mps2": rate, "greatest_mps2": self.driving.acceleration_mps2,
+            "mode": "on", "emergency_mps2": rate, "service_mps2": rate, "greatest_mps2": pull,
             "margin_m": rules.margin_m + DRIVER_MARGIN_M, "emergency_distance_m": 0.0,
         })  # fmt: skip
 
     @cached_property
     def relied_on_by_driver(self) -> supervisor.Assumed:
         """What a driver relies on of every train."""
-        return promise.planned(self.assumed, self.driver_rules.emergency_mps2)
+        return promise.planned(self.assumed, self.driver_braking)
 
     @property
     def driven(self) -> bool:
@@ -331,6 +349,7 @@ class Model:
             scenario=scenario, consists=Consists(first, *of_units), own=self.own[units], roster=roster._replace(**arrays, **tuples),
             bounds=Bounds(*(rows[trains] for rows in self.bounds)), clamps=Bounds(*(rows[trains] for rows in self.clamps)),
             assumed=_rows(self.assumed, trains), relied_on_by_driver=_rows(self.relied_on_by_driver, trains),
+            driver_acceleration=self.driver_acceleration[trains], driver_braking=self.driver_braking[trains],
             cruise=self.cruise[trains], start_track=self.start_track[trains], further_edges=further_edges,
         )  # fmt: skip
         return found

@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import combinations
+from itertools import combinations, pairwise
 
+import numpy as np
+
+from sumo_net import Rails
+from trainctl.railway import along, solvable
+from trainctl.railway.ways import ways as laid
 from trainctl.scenario.events import Order
+from trainctl.signals import Floats, Ints
 
 
 def mistakes(orders: Sequence[Order], routes: Mapping[str, Sequence[str]], twin: Mapping[str, str]) -> list[str]:
@@ -38,6 +44,59 @@ def mistakes(orders: Sequence[Order], routes: Mapping[str, Sequence[str]], twin:
                 if edge == routes[a][0] == routes[b][0] and number[b] < number[a]:
                     found.append(f"{said}: {b} enters first, over edge {edge}, and they cannot change places on their routes")
     return list(dict.fromkeys(found))
+
+
+def without_solution(
+    orders: Sequence[Order], ids: Sequence[str], legs: Sequence[Sequence[Ints]], rails: Rails, place: Floats, length: Floats,
+    clearance: float, may_change: str = "",
+) -> tuple[list[str], list[str]]:  # fmt: skip
+    """Trains that can never all get out, whoever decides: mistakes; and what could not be decided: notes. One line each.
+
+    Parameters
+    ----------
+    orders : sequence of Order
+        Free of the mistakes of ``mistakes``.
+    ids : sequence of str
+        Names of the n trains, in the order in which they come that enter over one edge.
+    legs : sequence
+        Edges of the way of each, in parts where it turns.
+    rails : Rails
+        The net.
+    place, length : ndarray, shape (n,)
+        Where each enters on its first edge, and its length [m].
+    clearance : float
+        Room one standing train needs beyond its length [m].
+    may_change : str, optional
+        Why trains may run otherwise than is known now: then nothing is decided.
+    """
+    net = along.net(rails)
+    found = list[str]()
+    for i, parts in enumerate(legs):
+        ways = laid(parts, rails.start_m, rails.length_m)
+        for _, row in solvable.meets_itself(ways, net, np.full(len(parts), length[i])):
+            edge = rails.edges[ways.edge[row]]
+            found.append(f"network.sumocfg: train {ids[i]}: {length[i]:g} m long, meets itself on edge {edge}: its loop is shorter")
+    if found or not orders:
+        return ([] if may_change else found), []
+    said = f"order: whether all trains can get out as the {len(orders)} orders say"
+    if may_change := may_change or ("trains turn back" if any(len(parts) > 1 for parts in legs) else ""):
+        return [], [f"{said} is not decided: {may_change}"]
+    ways, number = laid([parts[0] for parts in legs], rails.start_m, rails.length_m), {name: i for i, name in enumerate(ids)}
+    pairs = []
+    for order in orders:
+        here = [e for e in (rails.index[order.edge], int(rails.twin[rails.index[order.edge]])) if e >= 0]
+        for a, b in pairwise(order.trains):
+            first, then = (
+                int(ways.first[i] + np.flatnonzero(np.isin(ways.edge[ways.first[i] : ways.first[i + 1]], here))[0])
+                for i in (number[a], number[b])
+            )
+            pairs.append((number[b], then, number[a], first))
+    start = ways.begin[ways.first[:-1]] + place
+    result = solvable.search(solvable.Case(ways, net, start, length + clearance, pairs))
+    if result.solution is None:
+        return [], [f"{said} is not decided: {result.states} states were looked at"]
+    stay = ", ".join(ids[i] for i in result.left)
+    return [] if result.solution else [f"order: no solution: {stay} can never all get out if the orders are kept"], []
 
 
 def _together(a: Sequence[str], b: Sequence[str], edges: tuple[str, str]) -> list[str]:

@@ -122,8 +122,8 @@ def assume(p: Model) -> Assumed:
     )
 
 
-def planned(assumed: Assumed, rate: float) -> Assumed:
-    """What a driver relies on who brakes with ``rate`` [m/s2]: he keeps away farther than the supervisor asks.
+def planned(assumed: Assumed, rate: Floats) -> Assumed:
+    """What a driver relies on who brakes every train with ``rate`` (n,) [m/s2]: he keeps away farther than the supervisor asks.
 
     Behind a train of the same speed he brakes for ``D(v) - D(w)`` with the rates below: its difference is at least that of the
     supervisor's rates. His positions are true ones, the supervisor's told room is less by up to the uncertainties.
@@ -165,11 +165,14 @@ def _weak(p: Model) -> list[str]:
             f"supervisor.mode = on: train {p.scenario.ids[i]}{among} cannot be relied on to brake: {_why(p, found, i)}; it takes"
             f" {cures}"
         ]
-    rate = p.driving.deceleration_mps2
+    rate = p.driver_braking
     if not p.placed and np.any(rate - assumed.scatter < LEAST_BRAKING):
-        i = int(np.argmax(assumed.scatter))
+        i = int(np.argmin(rate - assumed.scatter))
+        kind = p.scenario.train[i].type
+        stated = p.scenario.train_type[kind].driven_deceleration_mps2
+        key = "traffic.deceleration_mps2" if stated is None else f"train_type.{kind}.driven_deceleration_mps2"
         return [
-            f"traffic.deceleration_mps2 = {rate:g}: disturbances and faults take {assumed.scatter[i]:.3g} m/s2 of it from train"
+            f"{key} = {rate[i]:g}: disturbances and faults take {assumed.scatter[i]:.3g} m/s2 of it from train"
             f" {p.scenario.ids[i]}; at least {assumed.scatter[i] + LEAST_BRAKING:.3g}"
         ]
     return []
@@ -211,7 +214,7 @@ def _lost(p: Model) -> list[str]:
     view = authority.look(
         laid, along.net(p.rails), p.rails.speed_mps, np.zeros(len(p.rails.speed_mps), bool), np.ones(n), row, front, speed,
         p.consists.train_length(), np.ones(n, bool),
-        fastest + 1000.0, np.full(n, np.inf), None,
+        fastest + 1000.0, np.full(n, np.inf), None, p.rails.internal,
     )  # fmt: skip
     found = []
     late, enough = supervisor.too_late(rules, p.assumed, speed, view.targets, step, p.step_theta)

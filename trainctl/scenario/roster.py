@@ -14,7 +14,8 @@ import numpy as np
 from sumo_net import Line, LineError, Rails
 from sumo_net.layout import Gradient
 from trainctl.errors import InputError
-from trainctl.railway import turning
+from trainctl.railway import supervisor, turning
+from trainctl.railway.authority import DRIVER_MARGIN_M
 from trainctl.railway.turning import Yard
 from trainctl.scenario import mixed, passages
 from trainctl.scenario.tables import Scenario, TrafficTable, Train, TrainType
@@ -210,6 +211,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         if event.train in ids and driven[ids.index(event.train)]
     ]
     trains, routes, stops, arrival = list[Train](), list[tuple[tuple[str, ...], ...]](), list[tuple[Stop, ...]](), list[float]()
+    edges = list[list[Ints]]()  # of the legs of all trains
     placed_m = list[float]()
     factor = np.array([min(traffic.kinds[d.kind].speed_factor, 1.0) for d in traffic.departures])
     for d, share, other in zip(traffic.departures, factor.tolist(), driven.tolist(), strict=True):
@@ -234,6 +236,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         except ValueError as error:
             found.append(f"network.sumocfg: train {d.id}: {error}")
             continue
+        edges.append(parts)
         placed_m.append(d.position_m)
         routes.append(tuple(tuple(rails.edges[e] for e in part.tolist()) for part in parts))
         trains.append(
@@ -262,8 +265,16 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
             ordered, wrong = mixed.constraints(scenario.order, ways, trips, rails, traffic.signals)
             given = given._replace(additional=(*given.additional, *ordered))
             bad, notes = mixed.unkept(traffic.source.elements.others, traffic.signals, given.trips)
-            found, told = [*found, *wrong, *bad], [*told, *notes]
+            found, told = [*found, *wrong, *bad], [*told, *notes, *mixed.of_formations(together, traffic.source.options)]
         else:
+            size = np.array([types[d.kind].per_unit("unit_length_m").sum() for d in traffic.departures])
+            margin = (scenario.supervisor or supervisor.Params()).margin_m + DRIVER_MARGIN_M
+            place = np.array([d.position_m for d in traffic.departures])
+            led = traffic.closings or traffic.choices or any(event.kind == "reroute" for event in scenario.event)
+            changes = "trains may be led another way" if led else ""
+            changes = changes if traffic.patience_s == math.inf else "who cannot enter for long does not come"
+            wrong, notes = passages.without_solution(scenario.order, ids, edges, rails, place, size, margin, changes)
+            found, told = [*found, *wrong], [*told, *notes]
             told += of_signals(traffic.junctions, traffic.source.options, traffic.source.elements.others)
     if found:
         raise InputError(list(dict.fromkeys(found)))

@@ -218,8 +218,17 @@ class TrainType(Table):
         None, gt=-50.0, lt=100.0, description="True mass less the stated one [%], which law, observer and train go by; default 0."
     )
 
+    driven_acceleration_mps2: Positive | None = Field(
+        None, description="How trains of this type accelerate where they are driven [m/s2]; default as [traffic] says."
+    )
+    driven_deceleration_mps2: Positive | None = Field(
+        None, description="How they brake where they are driven, positive [m/s2]; default as [traffic] says."
+    )
+
     #: Keys whose list may be one shorter than the units: couplers.
     _couplers = ("coupler_stiffness_n_per_m", "coupler_damping_ns_per_m")
+    #: Keys of the train as a whole.
+    _whole = ("units", "force_share", "mass_error_percent", "driven_acceleration_mps2", "driven_deceleration_mps2")
     #: Keys by which the force of a train is shared out.
     _shared = ("traction_n", "braking_n")
 
@@ -228,7 +237,7 @@ class TrainType(Table):
         wrong = []
         for key in type(self).model_fields:
             value = getattr(self, key)
-            if key in ("units", "force_share", "mass_error_percent") or value is None:
+            if key in self._whole or value is None:
                 continue
             if isinstance(value, tuple):
                 lengths = (self.units, self.units - 1) if key in self._couplers else (self.units,)

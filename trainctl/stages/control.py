@@ -69,24 +69,23 @@ class Control:
         """
         run = self.p.scenario.run
         if self.p.sampled and k % run.held_steps == 0:
-            believed = resistance(own)
-            demand, formed, messages, memory = self.evaluated(k, t, own, believed, formed, messages, memory, disturbed)
+            demand, formed, messages, memory = self.evaluated(k, t, own, resistance, formed, messages, memory, disturbed)
             if self.strict:
                 self._check(t, demand)
             if added.any():
                 demand = demand._replace(acceleration=demand.acceleration + added)
-            demand = self.clamped(demand, own, believed)
+            demand = self.clamped(demand, own, resistance)
         free = np.isnan(commanded)
         if not free.all():
             asked = Demand(np.where(free, demand.acceleration, commanded), demand.saturated & free)
-            demand = self.clamped(asked, own, resistance(own))
+            demand = self.clamped(asked, own, resistance)
         return demand, formed, messages, memory
 
     def evaluated(
-        self, k: int, t: float, own: Floats, resistance: Floats, formed: Formed, messages: Messages, memory: Any,
-        disturbed: Disturbed,
+        self, k: int, t: float, own: Floats, resistance: Callable[[Floats], Floats], formed: Formed, messages: Messages,
+        memory: Any, disturbed: Disturbed,
     ) -> tuple[Demand, Formed, Messages, Any]:  # fmt: skip
-        """What the law asks for in the step ``k``, as it is; arguments as those of ``step``, ``resistance`` (n,) for ``own``."""
+        """What the law asks for in the step ``k``, as it is; arguments as those of ``step``."""
         law = self.p.law
         trains, leader, _, links, messages, memory = self.exchanged(
             k, t, own, resistance, formed, messages, memory, disturbed
@@ -98,8 +97,8 @@ class Control:
         return demand, formed._replace(links=links), messages, memory
 
     def exchanged(
-        self, k: int, t: float, own: Floats, resistance: Floats, formed: Formed, messages: Messages, memory: Any,
-        disturbed: Disturbed,
+        self, k: int, t: float, own: Floats, resistance: Callable[[Floats], Floats], formed: Formed, messages: Messages,
+        memory: Any, disturbed: Disturbed,
     ) -> Exchanged:  # fmt: skip
         """What every train knows in the step ``k``; arguments as those of ``evaluated``.
 
@@ -109,12 +108,12 @@ class Control:
         same = k, formed, messages, memory
         if (
             self.answer is not None and all(a is b for a, b in zip(same, self.asked[:4], strict=True))
-            and np.array_equal(own, self.asked[4]) and np.array_equal(disturbed.measurement, self.asked[5])
+            and (own == self.asked[4]).all() and (disturbed.measurement == self.asked[5]).all()
         ):  # fmt: skip
             return self.answer
         p, law = self.p, self.p.law
         leader = formed.references.leader(t)
-        trains = Trains(p.fronts(own) + disturbed.measurement, p.speeds(own), resistance)
+        trains = Trains(p.fronts(own) + disturbed.measurement, p.speeds(own), resistance(own))
         if p.remembers and k == 0:
             memory = law.initial(p.params, p.scene(own, formed.links, t))
         said = law.message(formed.constants, trains, leader, *((memory,) if p.remembers else ()))
@@ -132,12 +131,12 @@ class Control:
             names = ", ".join(self.p.scenario.ids[i] for i in wrong)
             raise LawError(f"law {self.p.scenario.controller.law} gave a number that is not finite for train {names} at {t:g} s")
 
-    def clamped(self, demand: Demand, own: Floats, resistance: Floats) -> Demand:
+    def clamped(self, demand: Demand, own: Floats, resistance: Callable[[Floats], Floats]) -> Demand:
         """Speed and input clamps of a law whose model has them, for trains of units."""
         if not self.clamps:
             return demand
         bounds, speed, asked = self.p.bounds, own[self.p.leading, SPEED], demand.acceleration
-        period = self.p.scenario.run.control_period_s or self.p.scenario.run.step_s
-        given = np.clip(asked, bounds.input_lower - resistance, bounds.input_upper - resistance)
+        period, believed = self.p.scenario.run.control_period_s or self.p.scenario.run.step_s, resistance(own)
+        given = np.clip(asked, bounds.input_lower - believed, bounds.input_upper - believed)
         given = np.clip(given, (bounds.speed_lower - speed) / period, (bounds.speed_upper - speed) / period)
         return Demand(given, demand.saturated | (given != asked))

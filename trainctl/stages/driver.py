@@ -57,6 +57,7 @@ class Driver:
         self.p, self.n = p, len(p.scenario.ids)
         self.step_s, self.theta = p.scenario.run.step_s, p.step_theta
         self.rules, self.assumed = p.driver_rules, p.relied_on_by_driver
+        self.pulls, self.brakes = p.driver_acceleration, p.driver_braking
         self.maximum = p.band[1]
 
     def step(
@@ -95,10 +96,13 @@ class Driver:
         clear = authority.with_targets(authority.of(view.clear, first[view.clear.train]), *around.stops, STOP)
         free = authority.judge(self.rules, v, targets, clear, supervisor.no_limits(), *judged).maximum
         lowest = np.full(self.n, np.inf)
-        np.minimum.at(lowest, front, np.minimum(by_limits, np.where(first, free, np.inf)))
+        np.minimum.at(lowest, front, np.maximum(np.minimum(by_limits, np.where(first, free, np.inf)), -self.brakes))
+        pulls, brakes = np.full(self.n, np.inf), np.full(self.n, np.inf)
+        np.minimum.at(pulls, front, self.pulls)
+        np.minimum.at(brakes, front, self.brakes)
         wish = (self._wish(v, view, traffic, formed) - v) / self.step_s
-        rate = np.minimum(np.maximum(wish, -self.p.driving.deceleration_mps2), lowest)
-        rate = np.maximum(np.minimum(rate, self.p.driving.acceleration_mps2), -v / self.step_s)[front]
+        rate = np.minimum(np.maximum(wish, -brakes), lowest)
+        rate = np.maximum(np.minimum(rate, pulls), -v / self.step_s)[front]
         rate = np.where(traffic.standing, 0.0, rate)
         halted = ~led & (np.abs(speed) < HELD_MPS) & (rate <= 0.0)
         ordered_pace = references.pace._replace(acceleration=np.where(led, rate, 0.0))

@@ -15,7 +15,7 @@ import numpy as np
 from sumo_net.line import LineCrossover
 from trainctl.errors import InputError
 from trainctl.railway.ways import Ways
-from trainctl.scenario import promise
+from trainctl.scenario import mixed, promise
 from trainctl.scenario.events import Event
 from trainctl.scenario.model import Model
 from trainctl.signals import Floats, Ints, Seen
@@ -240,6 +240,9 @@ class Orders:
         new = [*way[: k - 1].tolist(), *path.tolist(), *([] if onward is None else onward[1:].tolist())]
         if why := promise.uncovered(self.p, i, new):
             raise Refused(f"the path to edge {event.to_edge} has {why}")
+        signals = self.p.roster.signals
+        if self.p.obeys and (where := mixed.without_signal(ways, i, row, new, self.p.scenario.ids, rails, signals)):
+            raise Refused(f"signals are obeyed, and on the path to edge {event.to_edge} none stands {where}")
         common = next((n for n, (a, b) in enumerate(zip(new, way.tolist(), strict=False)) if a != b), min(len(new), len(way)))
         more = {"to_edge": event.to_edge, "from_edge": rails.edges[int(way[max(common - 1, 0)])], "goes_on": onward is not None}
         return tuple(rails.edges[e] for e in new), more

@@ -113,7 +113,7 @@ class Points:
         """A point has no couplers."""
         return np.zeros(len(own))
 
-    def overrun(self, own: Floats, braking: float) -> Floats:
+    def overrun(self, own: Floats, braking: Floats) -> Floats:
         """Nothing acts late here."""
         return np.zeros(len(own))
 
@@ -359,8 +359,8 @@ class Units:
         more: Floats = np.maximum(fastest - v[self.p.leading], 0.0)
         return more
 
-    def overrun(self, own: Floats, braking: float) -> Floats:
-        """How much farther every train runs to standstill than by ``braking`` [m/s2] from now on, as actuators act late [m], (n,).
+    def overrun(self, own: Floats, braking: Floats) -> Floats:
+        """How much farther every train runs to standstill than by ``braking`` (n,) [m/s2] from now on, as actuators act late [m].
 
         Until its brakes act a train gains the speed (a + b) / r on the plan, and loses it only by braking to the end.
         """

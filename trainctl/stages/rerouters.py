@@ -13,6 +13,7 @@ import numpy as np
 
 from trainctl import draws
 from trainctl.railway.ways import Ways
+from trainctl.scenario import mixed
 from trainctl.scenario.model import Model
 from trainctl.signals import Floats, Ints, Seen
 from trainctl.stages.record import Journal
@@ -125,6 +126,10 @@ class Rerouters:
                 return ()
             if new == way:
                 return ()
+            if why := self._no_signal(i, ways, row, new):
+                said = {"reason": why, "position_m": float(seen.position[i])}
+                self.journal.event(t, "reroute_refused", train=train.id, **said)
+                return ()
             self.journal.event(t, "reroute", train=train.id, to_edge=wanted[-1], from_edge=edge)
             return tuple(rails.edges[e] for e in new)
         return ()
@@ -142,8 +147,9 @@ class Rerouters:
         blocked = next(e for e in way[1:] if e in closed)
         new = None if blocked in way[:kept] else self._path(i, way, kept, closed)
         said: dict[str, Any] = {"closed": rails.edges[blocked], "from_edge": edge}
-        if new is None:
-            why = "it cannot brake before the switch any more" if blocked in way[:kept] else "there is no other way"
+        why = "" if new is None else self._no_signal(i, ways, row, new)
+        if new is None or why:
+            why = why or ("it cannot brake before the switch any more" if blocked in way[:kept] else "there is no other way")
             self.journal.event(
                 t, "reroute_refused", train=train.id, reason=f"edge {rails.edges[blocked]} is closed; {why}",
                 position_m=float(seen.position[i]), speed_mps=speed,
@@ -151,6 +157,12 @@ class Rerouters:
             return None
         self.journal.event(t, "reroute", train=train.id, **said)
         return tuple(rails.edges[e] for e in new)
+
+    def _no_signal(self, i: int, ways: Ways, row: int, edges: Sequence[int]) -> str:
+        """Why train ``i`` is not led over ``edges`` where signals are obeyed; "": it is."""
+        p = self.p
+        where = mixed.without_signal(ways, i, row, edges, p.scenario.ids, p.rails, p.roster.signals) if p.obeys else ""
+        return f"signals are obeyed, and on the other way none stands {where}" if where else ""
 
     def _shut(self, t: float, i: int, edge: str) -> set[int]:
         """Edges that are closed now to train ``i`` by the rerouters on this one."""

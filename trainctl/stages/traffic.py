@@ -14,6 +14,7 @@ from trainctl.railway.authority import DRIVER_MARGIN_M, View
 from trainctl.railway.interlocking import Held
 from trainctl.railway.ways import Ways, moved, unchanged
 from trainctl.record.columns import Call
+from trainctl.scenario import mixed
 from trainctl.scenario.model import Model
 from trainctl.scenario.roster import Stop
 from trainctl.signals import Bools, Floats, Ints, Seen
@@ -101,15 +102,13 @@ class Traffic:
         self.room = Room(p)
         self.net, self.length = along.net(p.rails), p.consists.train_length()
         self.looks, self.join_range_m = p.looks_ahead, p.driving.join_range_m if p.driven else 0.0
-        planned = min(
-            p.supervision.emergency_mps2, p.supervision.service_mps2, *([p.driving.deceleration_mps2] if p.driven else [])
-        )
+        planned = np.minimum(p.supervision.service_mps2, p.driver_braking if p.driven else p.supervision.emergency_mps2)
         self.requesting = np.minimum(p.assumed.braking, planned)  # what is requested for, and braked with at least
         number = {name: i for i, name in enumerate(p.scenario.ids)}
-        # Pairs of trains that pass an edge one after the other: edge, who goes first, who comes next.
-        self.pairs = [
+        self.pairs = [  # edge, who passes it first, and who comes next
             (p.rails.index[order.edge], number[a], number[b]) for order in p.scenario.order for a, b in pairwise(order.trains)
         ]
+        self.yields = mixed.yielding(p.roster.handed, p.roster.edge)
         self.settles = float(np.max(supervisor.settles(p.assumed, p.assumed.braking), initial=0.0))
         self.ways: Ways | None = None
         self._limits(0.0)
@@ -201,25 +200,20 @@ class Traffic:
             )  # fmt: skip
         return s._replace(came=(s.came | there) & ~(s.entering & ~there), entering=np.zeros_like(s.entering))
 
-    def kept_parked(self, trains: Sequence[int], s: State) -> State:
-        """Trains that SUMO has not let back from where they are parked: they are to ask again."""
-        parked = s.parked.copy()
-        parked[trains] = True
-        return s._replace(parked=parked)
-
     def due(self, t: float, s: State) -> list[int]:
-        """Trains that are to come at ``t``: of each edge the first that waits there."""
+        """Trains that are to come at ``t``: of each edge the first that waits there, and the next if SUMO lets that go first."""
         if s.came.all():
             return []
-        first: dict[int, int] = {}
+        found, taken = list[int](), set[int]()
         for i in np.flatnonzero(~s.came & ~self.roster.driven & (self.roster.depart <= t + 1e-9) & ~self._given_up(t)).tolist():
-            first.setdefault(int(self.roster.edge[i]), i)
-        return sorted(first.values(), key=lambda i: (self.roster.depart[i], i))
+            if (edge := int(self.roster.edge[i])) not in taken:
+                found.append(i)
+                taken |= set() if i in self.yields else {edge}
+        return sorted(found, key=lambda i: (self.roster.depart[i], i))
 
     def _given_up(self, t: float) -> Bools:
         """Trains that would not come any more if they had not yet."""
-        late: Bools = t > self.roster.depart + self.roster.patience + 1e-9
-        return late
+        return np.asarray(t > self.roster.depart + self.roster.patience + 1e-9)
 
     def missing(self, t: float, s: State) -> list[str]:
         """Trains that were due and never came."""
@@ -268,7 +262,8 @@ class Traffic:
             if v is None:
                 kept_out[i] = waiting.kept_out(view, i)
                 continue
-            came[i], entering[i], speed[i], together = True, True, v, None
+            # Who may not come yet is in no other's way.
+            present[i], came[i], entering[i], speed[i], together = i not in self.yields, True, True, v, None
             reach = self._reach(speed)
             come.append((i, v))
         keeping = np.full(len(speed), -1)
@@ -345,9 +340,7 @@ class Traffic:
 
     def _place(self, stop: Stop, i: int, s: State) -> float:
         """Where train ``i`` has to stand now for a stop, or to have passed [m]: no farther than it may to turn afterwards."""
-        last = self.turns.last_place(i)
-        if stop.passing:
-            return min(stop.place, last - PASSED_M)
+        last = self.turns.last_place(i) - (PASSED_M if stop.passing else 0.0)
         return min(stop.place, last) - (stop.waits_before if self._full(stop, s) else 0.0)
 
     def _further(self, stop: Stop, i: int) -> float:
@@ -458,7 +451,7 @@ class Traffic:
         braking = supervisor.stopping_distance(v, self.requesting, self.step_s, self.theta)
         return braking + 4.0 * v * self.step_s + rules.margin_m + 2.0 * DRIVER_MARGIN_M + 50.0 + 6.0 * assumed.uncertainty
 
-    def _ordered(self, t: float, ways: Ways, seen: Seen, s: State) -> list[tuple[int, int, int]]:
+    def _ordered(self, t: float, ways: Ways, seen: Seen, s: State) -> list[zones.Ordered]:
         """Trains that must let another one pass an edge first, see ``zones.passes_first``."""
         return zones.passes_first(self.pairs, self.net, ways, seen.row, s.came, s.left | ~s.came & self._given_up(t))
 
@@ -481,7 +474,8 @@ class Traffic:
                 )  # fmt: skip
             elif one.granted and not one.join and s.waits_for[one.train] >= 0:
                 self.journal.event(t, "switch_granted", train=ids[one.train], edge=edges[one.zone])
-        room = zones.short_of_junctions(ways, self.net, self.p.rails.internal, seen.row, seen.position, held.room)
+        everyone, inside = np.arange(len(held.room)), self.p.rails.internal
+        room = zones.short_of_junctions(ways, self.net, inside, everyone, seen.row, seen.position, held.room)
         return s._replace(requests=requests, waits_for=held.by.copy()), held._replace(room=room)
 
     def _look(self, ways: Ways, seen: Seen, speed: Floats, held: Held, s: State, reach: Floats) -> View:
@@ -496,5 +490,5 @@ class Traffic:
         return authority.look(
             ways, self.net, self.limit, self.falls, self.roster.speed_factor, seen.row, seen.position,
             np.where(self.roster.driven, 0.0, speed), self.length, seen.present, horizon, held.room, order,
-            supervisor.SIGNAL if self.p.obeys else supervisor.SWITCH,
+            self.p.rails.internal, supervisor.SIGNAL if self.p.obeys else supervisor.SWITCH,
         )  # fmt: skip

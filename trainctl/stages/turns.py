@@ -24,8 +24,8 @@ from trainctl.stages.record import Journal
 #: A train aims this far into the track on which it may turn [m], if there is room.
 INTO_M = 2.0
 
-#: Who must let another train pass first, see ``interlocking.request``: from ways and rows of trains.
-Ordered = Callable[[Ways, Ints], list[tuple[int, int, int]]]
+#: Who must let another train pass first: from ways and rows of trains.
+Orders = Callable[[Ways, Ints], list[zones.Ordered]]
 
 
 #: How often every train has turned, since when it stands to turn [s] (NaN: it does not), which train prevents it (-1: none).
@@ -130,7 +130,7 @@ class Turns:
 
     def step(
         self, t: float, asks: Sequence[int], ways: Ways, seen: Seen, reach: Floats, standing: Bools, requests: interlocking.State,
-        known: Known, ordered: Ordered | None,
+        known: Known, ordered: Orders | None,
     ) -> tuple[interlocking.State, Known, tuple[Turn, ...]]:  # fmt: skip
         """Let trains turn that stand for it and ask, where the way back is theirs; arguments as those of ``ask``."""
         if not asks:
@@ -149,7 +149,7 @@ class Turns:
 
     def ask(
         self, trains: Sequence[int], ways: Ways, seen: Seen, reach: Floats, leg: Ints, standing: Bools,
-        requests: interlocking.State, ordered: Ordered | None,
+        requests: interlocking.State, ordered: Orders | None,
     ) -> Asked:  # fmt: skip
         """Ask for the ways back, one train after the other: each as if it were to enter the net where it stands.
 
@@ -166,7 +166,7 @@ class Turns:
         requests : interlocking.State
             Of all trains.
         ordered : callable, optional
-            See ``Ordered``; None: signals decide. A train has its block then, and its signal on the way back holds it.
+            See ``Orders``; None: signals decide. A train has its block then, and its signal on the way back holds it.
         """
         line, arrival = self.p.line, self.p.roster.arrival
         turns, kept, leg = [], dict[int, int](), leg.copy()
@@ -190,7 +190,7 @@ class Turns:
 
     def _requested(
         self, i: int, there: Ways, row: Ints, position: Floats, present: Bools, reach: Floats, leg: Ints, standing: Bools,
-        requests: interlocking.State, ordered: Ordered,
+        requests: interlocking.State, ordered: Orders,
     ) -> tuple[interlocking.State, int | None]:  # fmt: skip
         """Requests with the way back of ``i`` granted, and None; or as they were, and because of whom it is not."""
         asks, along_it = np.arange(len(row)) == i, zones.of(there, self.net, self.later)

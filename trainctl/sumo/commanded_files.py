@@ -15,7 +15,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from trainctl.signals import Start
+from trainctl.signals import Floats, Start
 from trainctl.sumo.signal_box import NOT_WITH_SIGNALS, Obeyed, write
 
 OPTIONS = {
@@ -44,15 +44,19 @@ LOGS = {
     "log": "messages.log",
 }
 
+#: A stop without an end [s].
+HELD_S = 1e6
+
 #: Acceleration and braking of trains whose drivers decide nothing.
 _IDLE = 'accel="100" decel="100"'
 
 
-def write_routes(start: Start, path: Path, obeyed: Obeyed | None = None) -> list[str]:
+def write_routes(start: Start, path: Path, obeyed: Obeyed | None = None, limit: Floats | None = None) -> list[str]:
     """The trains as SUMO vehicles: true lengths and carriages, no randomness, no limits of SUMO's own.
 
     Those that come later have their types here and are added when they come. Returns the type of every train. Where signals are
-    ``obeyed`` a type brakes as its trains do, and SUMO lets no train in before the block is free.
+    ``obeyed`` a type brakes as its trains do, and SUMO lets no train in before the block is free. ``limit`` (n,) is that of the net
+    where each train starts [m/s]: SUMO refuses one that is faster, as a sign may allow, but for a speed factor.
     """
     types: dict[tuple[str, tuple[float, ...], str], str] = {}
     taken = set() if obeyed is None else set(re.findall(r'<vType [^>]*id="([^"]*)"', "".join(obeyed.handed.types)))
@@ -67,12 +71,13 @@ def write_routes(start: Start, path: Path, obeyed: Obeyed | None = None) -> list
         kinds.append(kind)
         if not start.present[i] or (obeyed is not None and obeyed.driven[i]):
             continue
-        route = " ".join(normal(start.routes[i]))
+        route = " ".join(normal(start.routes[i] if obeyed is None else obeyed.way(i)))
         arrival = arrival_word(np.inf if start.arrival is None else float(start.arrival[i]))
+        fast = "" if limit is None or start.speed[i] <= limit[i] else f' speedFactor="{float(start.speed[i] / limit[i]) + 1e-6!r}"'
         rows.append(
-            f'    <vehicle id={quoteattr(name)} type="{kind}" depart="{begin}" departLane="best"{checks}'
+            f'    <vehicle id={quoteattr(name)} type="{kind}" depart="{begin}" departLane="best"{checks}{fast}'
             f' departPos="{float(start.lane_position[i])!r}" departSpeed="{float(start.speed[i])!r}" arrivalPos="{arrival}">\n'
-            f'        <route edges="{route}"/>{_trip(obeyed, i)}\n    </vehicle>\n'
+            f'        <route edges="{route}"/>{_hold(obeyed, i)}{_trip(obeyed, i)}\n    </vehicle>\n'
         )
     with path.open("w", encoding="utf-8") as out:
         out.write("<routes>\n")
@@ -86,6 +91,14 @@ def write_routes(start: Start, path: Path, obeyed: Obeyed | None = None) -> list
         out.writelines(rows)
         out.write("</routes>\n")
     return kinds
+
+
+def _hold(obeyed: Obeyed | None, i: int) -> str:
+    """A stop that holds a train where it is to turn first."""
+    if obeyed is None or (place := obeyed.hold(i, 0)) is None:
+        return ""
+    edge, begin, end = place
+    return f'<stop edge={quoteattr(edge)} startPos="{begin!r}" endPos="{end!r}" duration="{HELD_S:g}"/>'
 
 
 def _trip(obeyed: Obeyed | None, i: int) -> str:

@@ -22,7 +22,7 @@ from trainctl.railway.ways import Ways, rerouted, turned
 from trainctl.runs.sumo_logs import elements
 from trainctl.signals import Bools, Floats, Ints, Links, Seen, Start
 from trainctl.sumo.causes import SPEED_MODE_FREE, cause
-from trainctl.sumo.commanded_files import LOGS, arrival_word, normal, write_configuration, write_routes
+from trainctl.sumo.commanded_files import HELD_S, LOGS, arrival_word, normal, write_configuration, write_routes
 from trainctl.sumo.idling import OF_IDLING, idle_s, silent
 from trainctl.sumo.preflight import objections
 from trainctl.sumo.signal_box import Box, Obeyed
@@ -37,8 +37,8 @@ NEAR_M = 1e-3
 #: Closer than this to the end of its edge, or beyond, SUMO plans the step.
 PLANNED_M = 1.0
 
-#: A stop that a train parks at, until it is told to resume: its time [s], and the flag that says so.
-PARKS_S, PARKING = 1e6, 1
+#: Flag of a stop that a train parks at.
+PARKING = 1
 
 #: SUMO puts a train that turns so far beyond its place [m], and by the junctions under it; told to go as far before it turns, it
 #: stands where it should.
@@ -164,7 +164,7 @@ class Sumo(Session):
         wrong = objections(self.line, self.time_step)
         if wrong:
             raise SimulatorError("; ".join(wrong))
-        self.kinds = write_routes(start, self.folder / "trains.rou.xml", self.obeyed)
+        self.kinds = write_routes(start, self.folder / "trains.rou.xml", self.obeyed, self.line.speed_mps[start.edge])
         end = (self.steps + 1) * self.time_step
         configuration = write_configuration(
             self.folder, self.net.name, "trains.rou.xml", self.time_step, end, self.internal, self.record_every, self.obeyed
@@ -178,6 +178,9 @@ class Sumo(Session):
         self.length = start.length
         self.turning: list[tuple[int, tuple[str, ...], float]] = []
         self.taken_off: set[int] = set()
+        # Where signals are obeyed SUMO knows all of a route, and a stop holds who is to turn; how often each has.
+        self.held: set[int] = set() if self.obeyed is None else {i for i in range(len(self.ids)) if self.obeyed.hold(i, 0)}
+        self.leg = np.zeros(len(self.ids), np.int64)
         self.way_end = self._way_end()
         self.coming: list[tuple[int, float]] = []
         self.pending: dict[int, float] = {}
@@ -193,7 +196,10 @@ class Sumo(Session):
         self.seen = Seen(self.ways.begin[row] + start.lane_position, self.ways.edge[row], row, present)
         self.seen.position[everyone] = self.ways.begin[row[everyone]] + self._lane_positions(everyone)
         if self.obeyed is not None:
-            self.idle, self.box = False, Box(self, self.obeyed)
+            self.idle, self.box = (
+                False,
+                Box(self, self.obeyed, _direct(self.api.trafficlight.getRedYellowGreenState, "trafficlight")),
+            )
             self.seen = self.box.read().within(self.seen, self.ways)
         if self.idle:
             with silent():
@@ -277,7 +283,10 @@ class Sumo(Session):
         return Seen(position, ways.edge[row], row, present)
 
     def route(self, train: int, edges: tuple[str, ...]) -> None:
-        """Give a train another route."""
+        """Give a train another route: SUMO then knows it up to the next turn only."""
+        if train in self.held:
+            self._let_go(train)
+            self.held.remove(train)
         super().route(train, edges)
         self.way_end = self._way_end()
 
@@ -294,7 +303,8 @@ class Sumo(Session):
         if speed > max(self.api.lane.getMaxSpeed(f"{edge}_{k}") for k in lanes):  # a sign shows more than the net has
             self._call(self.api.edge.setMaxSpeed, edge, speed)
         if f"way_{name}" not in self.api.route.getIDList():
-            self._call(self.api.route.add, f"way_{name}", normal(self.routes[train]))
+            way = self.routes[train] if self.obeyed is None else self.obeyed.way(train)
+            self._call(self.api.route.add, f"way_{name}", normal(way))
         self._call(
             self.api.vehicle.add, name, f"way_{name}", typeID=self.kinds[train], depart="now", departLane="best",
             departPos=repr(float(self.departs_m[train])), departSpeed=repr(speed),
@@ -302,6 +312,7 @@ class Sumo(Session):
         )  # fmt: skip
         if self.obeyed is not None:
             self._call(self.api.vehicle.setParameter, name, "tripId", self.obeyed.handed.trips[train])
+            self._hold(train)
 
     def park(self, train: int, off: bool) -> None:
         """Let a train that stands leave its lane, by a stop without an end, or come back to it."""
@@ -325,7 +336,7 @@ class Sumo(Session):
             return
         if stands:
             self._stop_here(self.ids[train], 0)
-        elif self.api.vehicle.getStops(self.ids[train], 1):  # whoever comes back from where it was parked has none any more
+        elif self.api.vehicle.isStopped(self.ids[train]):  # whoever comes back from where it was parked has none any more
             self._call(self.api.vehicle.resume, self.ids[train])
 
     def _stop_here(self, name: str, flags: int) -> None:
@@ -333,14 +344,34 @@ class Sumo(Session):
         vehicle = self.api.vehicle
         edge, place = vehicle.getRoadID(name), vehicle.getLanePosition(name)
         self._call(
-            vehicle.setStop, name, edge, pos=place, laneIndex=vehicle.getLaneIndex(name), duration=PARKS_S, flags=flags,
+            vehicle.setStop, name, edge, pos=place, laneIndex=vehicle.getLaneIndex(name), duration=HELD_S, flags=flags,
             startPos=max(place - 1.0, 0.0),
         )  # fmt: skip
 
     def turn(self, train: int, edges: tuple[str, ...], arrival: float) -> None:
-        """Let a train turn back with the next ``move``: SUMO does as soon as the route says so, so it has not until now."""
-        self._call(self.api.vehicle.setRoute, self.ids[train], [self.line.edges[self.seen.edge[train]], *normal(edges)])
+        """Let a train turn back with the next ``move``: SUMO does as soon as the route says so, if no stop holds the train."""
+        name, vehicle = self.ids[train], self.api.vehicle
+        if train in self.held:
+            self._let_go(train)
+        else:
+            self._call(vehicle.setRoute, name, [self.line.edges[self.seen.edge[train]], *normal(edges)])
         self.turning.append((train, edges, arrival))
+
+    def _hold(self, train: int) -> None:
+        """Hold a train where it is to turn next."""
+        if train not in self.held or self.obeyed is None or (place := self.obeyed.hold(train, int(self.leg[train]))) is None:
+            return
+        edge, begin, end = place
+        name, lanes = self.ids[train], range(self.api.edge.getLaneNumber(edge))
+        kind = self.api.vehicle.getVehicleClass(name)
+        lane = next(k for k in lanes if kind in (let := self.api.lane.getAllowed(f"{edge}_{k}")) or not let)
+        self._call(self.api.vehicle.setStop, name, edge, pos=end, laneIndex=lane, duration=HELD_S, startPos=begin)
+
+    def _let_go(self, train: int) -> None:
+        """Hold a train no longer: its last stop is what does."""
+        name, vehicle = self.ids[train], self.api.vehicle
+        if stops := len(vehicle.getStops(name)):
+            self._call(vehicle.replaceStop, name, stops - 1, "")
 
     def linked(self, links: Links, formation: Ints) -> None:
         """Nothing is shown."""
@@ -388,7 +419,7 @@ class Sumo(Session):
                 self._call(vehicle.resume, self.ids[i])
             else:
                 kept.append(i)
-                self._call(vehicle.setStopParameter, self.ids[i], 0, "duration", repr(PARKS_S))
+                self._call(vehicle.setStopParameter, self.ids[i], 0, "duration", repr(HELD_S))
         self.returning.clear()
         if self.box is not None:
             self.box.parked = kept
@@ -412,6 +443,8 @@ class Sumo(Session):
         self.seen = self.seen._replace(row=rows)
         self.arrival[train] = arrival
         self.way_end = self._way_end()
+        self.leg[train] += 1
+        self._hold(train)
         if math.isfinite(arrival):  # SUMO takes a place of arrival for that of any route, so it knows of none
             self.taken_off.add(train)
         return float(self.ways.begin[row]) + place, float(line.length_m[self.ways.edge[row]]) - place
@@ -452,10 +485,10 @@ class Sumo(Session):
         return cause(self.api, self.ids[i], edges[0], normal(edges))
 
 
-def _direct(function: Any) -> Any:
+def _direct(function: Any, domain: str = "vehicle") -> Any:
     """Find the compiled function that a function of libsumo hands its arguments on to: handing on takes a third of a call."""
     compiled = getattr(sys.modules.get(function.__module__), "_libsumo", None)
-    return getattr(compiled, f"vehicle_{function.__name__}", function)
+    return getattr(compiled, f"{domain}_{function.__name__}", function)
 
 
 def _ended(path: Path) -> bool:

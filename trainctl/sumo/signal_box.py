@@ -6,6 +6,7 @@ driver wants is overruled all the same. SUMO lets no train in before the block i
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -28,6 +29,10 @@ NOBODY = "(nobody)"
 NOT_WITH_SIGNALS = ("insertion-checks", "default.speeddev")
 
 
+#: Length of the place at the end of an edge at which SUMO holds a train that is to turn [m].
+HOLD_M = 0.1
+
+
 class Obeyed(NamedTuple):
     """What a session needs to know where signals are obeyed."""
 
@@ -36,6 +41,22 @@ class Obeyed(NamedTuple):
     signals: tuple[tuple[str, int], ...]  # program and link of every signal, by its number
     braking: Floats  # (n,) m/s2, what trains of ours brake with
     rails: Rails
+    legs: tuple[tuple[tuple[str, ...], ...], ...]  # routes in parts, see ``Roster``
+
+    def way(self, train: int) -> tuple[str, ...]:
+        """All edges of a train's route: signals keep others from where it comes back to."""
+        return tuple(edge for leg in self.legs[train] for edge in leg)
+
+    def hold(self, train: int, leg: int) -> tuple[str, float, float] | None:
+        """Where a stop keeps SUMO from turning a train too early, at the end of this leg: edge, from and to [m]; None: nowhere.
+
+        The train stands and turns short of that, see ``turning.SHORT_M``.
+        """
+        if leg + 1 >= len(self.legs[train]):
+            return None
+        edge = self.legs[train][leg][-1]
+        end = float(self.rails.length_m[self.rails.index[edge]])
+        return edge, max(end - HOLD_M, 0.0), end
 
 
 def obeyed(p: Model) -> Obeyed | None:
@@ -45,7 +66,7 @@ def obeyed(p: Model) -> Obeyed | None:
         return None
     signals = tuple((one.name, one.link) for one in p.roster.signals)
     rate = np.minimum(p.driver_rules.service_mps2, p.relied_on_by_driver.braking)
-    return Obeyed(handed, p.roster.driven, signals, rate, p.rails)
+    return Obeyed(handed, p.roster.driven, signals, rate, p.rails, p.roster.legs)
 
 
 def write(obeyed: Obeyed, folder: Path) -> dict[str, str]:
@@ -74,12 +95,11 @@ class Read(NamedTuple):
 class Box:
     """The signals of a session that runs, and its trains that SUMO drives."""
 
-    def __init__(self, session: Session, obeyed: Obeyed) -> None:
-        self.session, self.obeyed = session, obeyed
+    def __init__(self, session: Session, obeyed: Obeyed, state: Callable[[str], str]) -> None:
+        self.session, self.obeyed, self.state = session, obeyed, state
         self.number = {name: i for i, name in enumerate(session.ids)}
         self.own = np.flatnonzero(obeyed.driven)
         self.speed = np.full(len(session.ids), np.nan)
-        self.state = session.api.trafficlight.getRedYellowGreenState
         self.parked: list[int] = []
         self.claims: list[list[int]] = []
         self.held: dict[tuple[int, int], set[tuple[str, str]]] = {}  # for each claim: signal and trip of those it holds

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
+from types import SimpleNamespace
 
-from trainctl.railway import authority, supervisor
+import numpy as np
+import pytest
+
+from trainctl.railway import along, authority, supervisor
 from trainctl.railway.supervisor import LIMIT, SWITCH, TRAIN, Limits, Params, Targets, as_ordered
+from trainctl.railway.ways import ways
 
 PARAMS = Params(mode="on")  # 1.0, 0.7, 20 m
 SPEED = np.array([30.0, 30.0, 30.0, 30.0])
@@ -48,3 +52,21 @@ def test_without_a_join_ahead_one_verdict_is_enough():
     alone, expected = judged(FOLLOW, FOLLOW), supervisor.verdict(PARAMS, SPEED, FOLLOW, SLOW, 1.0, 0.5)
     for a, b in zip(alone, expected, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_who_keeps_a_join_clear_stands_before_its_junction(inside):
+    """Two tracks come over 20 m and 30 m of a junction into a third one: edges a 0, b 1, m 2, and 3, 4 inside."""
+    length = np.array([1000.0, 1000.0, 2000.0, 20.0, 30.0])
+    net = SimpleNamespace(length_m=length, before=[[], [], [3, 4], [0], [1]], twin=np.full(5, -1), crossing=[[]] * 5)
+    there = ways([[0, 3, 2], [1, 4, 2]], np.zeros(5), length)
+    internal = np.array([False, False, False, True, True]) if inside else np.zeros(5, bool)
+    for front, room in ((400.0, 600.0 if inside else 620.0), (1010.0, 0.0 if inside else 10.0)):
+        row = there.first[:-1] + np.array([0 if front <= 1000.0 else 1, 1])
+        seen = authority.look(
+            there, along.net(net), np.full(5, 40.0), np.zeros(5, bool), np.ones(2), row, np.array([front, 1025.0]), np.zeros(2),
+            np.full(2, 100.0), np.ones(2, bool), 5000.0, np.full(2, np.inf), None, internal,
+        )  # fmt: skip
+        assert [
+            (int(k), float(r)) for i, k, r in zip(*seen.clear[:1], seen.clear.kind, seen.clear.room, strict=True) if i == 0
+        ] == [(SWITCH, room)]

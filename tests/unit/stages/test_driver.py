@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import nets
 import numpy as np
 import pytest
 from staged import Told, around, chained, prepared, target, view
@@ -56,6 +57,23 @@ def test_who_has_nothing_ahead_takes_up_the_cruising_speed(p):
     np.testing.assert_allclose(driven.ordered, -p.driving.deceleration_mps2)
     cab.v[:] = 35.0
     np.testing.assert_allclose(cab.step()[0].ordered, 0.0)
+
+
+def test_trains_are_driven_with_the_rates_of_their_types_and_a_formation_with_its_least(line):
+    changes = {"train_type": {"emu": {**nets.LAWS["robust_constrained"]["train_type"], "driven_deceleration_mps2": 0.3}}}
+    kinds = prepared(line, "robust_constrained", **changes)
+    assert kinds.driver_braking.tolist() == [0.3] * len(kinds.scenario.ids)
+    assert kinds.driver_acceleration.tolist() == [kinds.driving.acceleration_mps2] * len(kinds.scenario.ids)
+    cab = Cab(kinds, 30.0)
+    cab.driver.pulls = np.array([0.4, 0.1, 0.2] + [0.4] * (cab.n - 3))
+    np.testing.assert_allclose(cab.step()[0].ordered, cab.driver.pulls)
+    cab.formed = chained(cab.formed, [-1, 0] + [-1] * (cab.n - 2))
+    cab.formed.references.pace.speed[:] = 30.0
+    np.testing.assert_allclose(cab.step()[1].references.pace.acceleration[:2], 0.1)
+    near = cab.alone(
+        targets=target(2, kinds.driver_rules.margin_m, 0.0, TRAIN, other=0)
+    )  # too near: braked as planned all the same
+    assert cab.step(near)[0].ordered[2] == -0.3
 
 
 def test_limits_stops_and_trains_ahead_are_braked_for(p):
