@@ -210,7 +210,8 @@ def request(
                 blocker = shut[i][1]
             if blocker < 0:
                 with_it = _standing(trains, there, granted, i, [k, *rest], clearance, queues, joins, ordered, back)
-                blocker = deadlock.in_a_circle(with_it, i, trains.before(queues))
+                before = trains.before(queues)
+                blocker = max(deadlock.ahead(with_it, i, k, before), deadlock.in_a_circle(with_it, i, before), key=lambda j: j >= 0)
         if blocker >= 0:
             stuck.add(i, [k, *rest])
             behind.setdefault(e, i)
