@@ -243,7 +243,7 @@ def request(
             blocker = deadlock.in_a_circle(here, i, trains.before(queues))
         if blocker >= 0:
             room[i], zone[i], by[i] = 0.0, edge[row[i]], blocker
-        there[i] |= blocker < 0
+        there[i] = blocker < 0  # the next are judged without it
     for (i, e), k in stretches.items():
         if granted[i, e]:
             until[i] = max(until[i], begin[zones.ends[k]])
