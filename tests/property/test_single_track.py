@@ -16,9 +16,10 @@ def test_everybody_gets_out(seed):
     played(at_random(seed), seed)
 
 
-def test_who_is_to_enter_comes_behind_those_that_are_passing_its_place():
-    """A train on its way over the place of a longer one that is due got its turn at the next single track behind that one."""
-    played(at_random(5159), 5159, 1200.0)
+@pytest.mark.parametrize("seed", [5159, 8009, 9181])
+def test_trains_that_ask_far_ahead_get_out_too(seed):
+    """Turns behind one that was due where it passed; let in before others that stood ahead; two that came kept each other out."""
+    played(at_random(seed), seed, 1200.0)
 
 
 @pytest.mark.campaign

@@ -242,8 +242,8 @@ class Agents:
     def __init__(self, asked: Asked) -> None:
         self.asked = asked
         limit, wrong = asked.limit_mps2, []
-        if asked.runs < 1:
-            wrong.append(f"runs = {asked.runs}: must be at least 1")
+        if not isinstance(asked.runs, int) or asked.runs < 1:
+            wrong.append(f"runs = {asked.runs}: must be a whole number from 1 on")
         if not (np.isfinite(limit) and limit > 0):
             wrong.append(f"limit_mps2 = {limit}: must be finite and above 0")
         wrong += _unknown("backend", asked.backend, ("ensemble", "numeric", "sumo"))

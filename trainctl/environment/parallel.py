@@ -67,6 +67,8 @@ class ParallelTrains(ParallelEnv[str, Observation, Observation]):  # type: ignor
     ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:  # fmt: skip
         """Begin all runs anew; ``seed`` decides on starts, disturbances and losses of this and all further episodes."""
         if seed is not None:
+            if seed < 0:
+                raise InputError(f"seed = {seed}: must not be negative")
             self.random = np.random.default_rng(seed)
         now = self.trains.begin(self.random).astype(np.float32)
         self.agents, self.rows = list(self.possible_agents), np.arange(len(self.possible_agents))

@@ -262,6 +262,7 @@ def correction(i: int, constants: Constants, own: Floats, estimate: Floats, held
     """Right-hand sides of (13) with the corrections (14), without the input; then the force of (5) at u = 0."""
     c, m = constants, constants.train
     first, last = m.first[i], len(own) - 1
+    states = (estimate.shape[1] - F) // 2  # of the fault; the compiler knows this, but not the shape of C
     for j in range(last + 1):  # mu1, mu2: D1(v) - D1(v_hat) with its neighbours' D2, D3
         unit = m.units[first + j]
         v, vh = own[j, SPEED], estimate[j, V]
@@ -284,7 +285,7 @@ def correction(i: int, constants: Constants, own: Floats, estimate: Floats, held
             if j < last:
                 drift += unit[REAR] * out[j + 1, V_RATE]
         fault = 0.0
-        for q in range(c.C.shape[1]):
+        for q in range(states):
             fault += c.C[first + j, q] * estimate[j, F + q]
         out[j, W_DRIFT] = drift + fault
         out[j, UNCOMPENSATED] = (1.0 - c.compensated) * fault
@@ -297,7 +298,7 @@ def rate(
 ) -> None:
     """d(estimate)/dt of (13); the input is what was applied after the limits."""
     c, m = constants, constants.train
-    states = c.C.shape[1]
+    states = (estimate.shape[1] - F) // 2
     R = F + states  # the first remembered
     for j in range(len(own)):
         u = m.first[i] + j
@@ -310,7 +311,7 @@ def rate(
             out[j, W], ev = -SETTLE * estimate[j, W], 0.0
         out[j, F] = c.k4[u, 0] * ev
         out[j, R] = 0.0
-        for q in range(c.omega.shape[1]):
+        for q in range(states // 2):
             sine, cosine = F + 1 + 2 * q, F + 2 + 2 * q
             out[j, sine] = c.omega[u, q] * estimate[j, cosine] + c.k4[u, 1 + 2 * q] * ev
             out[j, cosine] = -c.omega[u, q] * estimate[j, sine] + c.k4[u, 2 + 2 * q] * ev

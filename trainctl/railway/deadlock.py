@@ -4,7 +4,8 @@ Every train runs on by itself until it *stands*: before the first stretch ahead 
 is another's turn, or behind a train that stands ahead of it; or it leaves the net. Trains that stand before one stretch stand
 behind each other. Train i *needs* train j if j may stand where i still has to pass: ahead of it on its way, on the twin of an edge
 of it, or across; or if j goes before it, at its turn or where both stand. A state is *safe* if no train needs, directly or through
-others, itself. A stretch is granted, and a train let into the net, only if it does not need itself afterwards.
+others, itself. A stretch is granted, and a train let into the net, only if it does not need itself afterwards. None is granted
+while another train may stand ahead on the way there: that would find the turns beyond taken by one that cannot come by.
 
 A train that turns stands at the end of its way, and needs besides those that may stand where it runs back: on its next leg, on the
 twin of that or across, but for those ahead of it that it turns its rear to.
@@ -173,6 +174,15 @@ def needs(here: Standing, i: int, goes_before: Before) -> Iterable[int]:
                 yield j
     if i in here.back:
         yield from _behind(here, i, goes_before)
+
+
+def ahead(here: Standing, i: int, k: int, goes_before: Before) -> int:
+    """A train that may stand ahead of ``i`` before row k of its way; -1: none."""
+    for r in range(int(here.row[i]), k):
+        for j, m, _ in here.on.get(int(here.ways.edge[r]), ()):
+            if j != i and i not in here.before[j] and goes_before(j, m, i, r):
+                return j
+    return -1
 
 
 def _behind(here: Standing, i: int, goes_before: Before) -> Iterable[int]:

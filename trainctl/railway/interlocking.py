@@ -210,7 +210,8 @@ def request(
                 blocker = shut[i][1]
             if blocker < 0:
                 with_it = _standing(trains, there, granted, i, [k, *rest], clearance, queues, joins, ordered, back)
-                blocker = deadlock.in_a_circle(with_it, i, trains.before(queues))
+                before = trains.before(queues)
+                blocker = max(deadlock.ahead(with_it, i, k, before), deadlock.in_a_circle(with_it, i, before), key=lambda j: j >= 0)
         if blocker >= 0:
             stuck.add(i, [k, *rest])
             behind.setdefault(e, i)
@@ -242,7 +243,7 @@ def request(
             blocker = deadlock.in_a_circle(here, i, trains.before(queues))
         if blocker >= 0:
             room[i], zone[i], by[i] = 0.0, edge[row[i]], blocker
-        there[i] |= blocker < 0
+        there[i] = blocker < 0  # the next are judged without it
     for (i, e), k in stretches.items():
         if granted[i, e]:
             until[i] = max(until[i], begin[zones.ends[k]])

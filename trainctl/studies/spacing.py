@@ -20,7 +20,6 @@ from trainctl.record.folder import write_json
 from trainctl.signals import POSITION, SPEED, Trains
 from trainctl.studies.capacity import LAW_ROWS
 from trainctl.studies.stops import (
-    REFUSED,
     ROWS,
     SAFE,
     Outcome,
@@ -66,11 +65,12 @@ class _Search:
 
     def smallest(self) -> tuple[Outcome, Outcome]:
         """The smallest spacing that is safe in all stops, and the one below it that is not; the same one if there is none."""
-        low, high = self.look(self.plan.from_m), self.look(self.plan.to_m)
-        while high.what == REFUSED and high.spacing_m > 2.0 * low.spacing_m:  # some laws know an upper end as well
+        low, top = self.look(self.plan.from_m), self.look(self.plan.to_m)
+        high = top
+        while high.what != SAFE and high.spacing_m > 2.0 * low.spacing_m:  # some laws know an upper end as well
             high = self.look(0.5 * high.spacing_m)
         if low.what == SAFE or high.what != SAFE:
-            return (low, low) if low.what == SAFE else (high, high)
+            return (low, low) if low.what == SAFE else (top, top)
         top = high
         low, high = self.between(low, high)
         while True:

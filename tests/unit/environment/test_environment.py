@@ -192,7 +192,8 @@ def test_a_run_in_sumo_leaves_its_folder(tmp_path):
     [
         ({}, {}, "runs cannot go abreast: it has events"),
         ({"backend": "sumo"}, {"law": "x"}, "law: unknown"),
-        ({"runs": 0}, SHORT, "runs = 0: must be at least 1"),
+        ({"runs": 0}, SHORT, "runs = 0: must be a whole number"),
+        ({"runs": 2.5}, SHORT, "runs = 2.5: must be a whole number"),
         ({"runs": 2, "backend": "numeric"}, SHORT, "several at once only with backend"),
         ({"limit_mps2": float("nan")}, SHORT, "limit_mps2 = nan"),
         ({"backend": "traci"}, SHORT, "backend = traci: must be one of ensemble, numeric, sumo"),
@@ -230,6 +231,8 @@ def test_actions_are_checked():
     with pytest.raises(InputError, match="reset_mask"):
         env.reset(options={"reset_mask": np.arange(6) == 2})
     side = ParallelTrains("fully_distributed", **SHORT)
+    with pytest.raises(InputError, match="seed = -1"):
+        side.reset(seed=-1)
     side.reset(seed=1)
     with pytest.raises(InputError, match="none of agent 2"):
         side.step({"1": np.zeros(1, np.float32)})

@@ -59,8 +59,8 @@ def test_no_train_but_the_first_is_told_of_the_order(tmp_path) -> None:
 class Thresholds:
     """Stops each of which needs a spacing of its own; what was asked."""
 
-    def __init__(self, monkeypatch, needs, refused_below=0.0, refused_above=math.inf) -> None:
-        self.needs, self.asked = needs, []
+    def __init__(self, monkeypatch, needs, refused_below=0.0, refused_above=math.inf, unsafe_above=math.inf) -> None:
+        self.needs, self.asked, self.unsafe_above = needs, [], unsafe_above
         self.refused = refused_below, refused_above
         monkeypatch.setattr(spacing, "stopped", self.stopped)
 
@@ -68,7 +68,7 @@ class Thresholds:
         self.asked.append((at, list(numbers)))
         if not self.refused[0] <= at <= self.refused[1]:
             return Outcome(at, REFUSED, 0, len(numbers), 0, math.inf, "too something"), None
-        failed = tuple(k for k in numbers if at < self.needs[k])
+        failed = tuple(k for k in numbers if not self.needs[k] <= at <= self.unsafe_above)
         return Outcome(at, UNSAFE if failed else SAFE, len(failed), len(numbers), len(failed), 1.0, "", failed), None
 
 
@@ -99,6 +99,12 @@ def test_refused_is_not_unsafe(monkeypatch, tmp_path) -> None:
 
 def test_a_law_with_an_upper_end_is_searched_below_it(monkeypatch, tmp_path) -> None:
     Thresholds(monkeypatch, [3000.0] * 6, refused_above=9000.0)
+    _, high = smallest(PLAN, tmp_path)
+    assert high.what == SAFE and high.spacing_m == pytest.approx(3000.0, rel=0.01)
+
+
+def test_a_law_that_is_unsafe_far_apart_is_searched_below_it(monkeypatch, tmp_path) -> None:
+    Thresholds(monkeypatch, [3000.0] * 6, unsafe_above=9000.0)
     _, high = smallest(PLAN, tmp_path)
     assert high.what == SAFE and high.spacing_m == pytest.approx(3000.0, rel=0.01)
 
