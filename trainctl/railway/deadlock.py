@@ -180,7 +180,7 @@ def ahead(here: Standing, i: int, k: int, goes_before: Before) -> int:
     """A train that may stand ahead of ``i`` before row k of its way; -1: none."""
     for r in range(int(here.row[i]), k):
         for j, m, _ in here.on.get(int(here.ways.edge[r]), ()):
-            if j != i and i not in here.before[j] and goes_before(j, m, i, r):
+            if j != i and i not in here.before.get(j, ()) and goes_before(j, m, i, r):
                 return j
     return -1
 
