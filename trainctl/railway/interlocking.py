@@ -124,6 +124,11 @@ def request(
     on, joining = present | outside, zones.net.joins.copy()
     joining[edge[zones.ways.first[:-1][outside]]] = True
     at = near(zones, joining, row, s, length, on, outside, until)
+    after = zones.following[row]
+    nearing = present & (after >= 0) & (begin[after] - s < reach)
+    room, zone, by = np.full(len(row), np.inf), np.full(len(row), -1, np.int64), np.full(len(row), -1, np.int64)
+    if not (len(at[0]) or len(ordered) or outside.any() or nearing.any() or state["joins"] or state["stretches"]):
+        return State(joins={}, stretches=[], until={}), Held(room, zone, by), []  # nobody is near anything to request
     joins: dict[tuple[int, int], int] = {}
     stretches: dict[tuple[int, int], int] = {}
     for i, k, is_join in zip(*(a.tolist() for a in at), strict=True):
@@ -173,7 +178,6 @@ def request(
     for key in order:
         if granted[key]:
             _lead(leading, zones, key[0], stretches[key])
-    room, zone, by = np.full(len(row), np.inf), np.full(len(row), -1, np.int64), np.full(len(row), -1, np.int64)
     behind: dict[int, int] = {}
     there = present.copy()  # and whoever is let in
     here: deadlock.Standing | None = None  # where trains on the net may come to stand, as long as nothing more is granted
@@ -256,8 +260,7 @@ def request(
     queues = {e: [i for i in queue if not barred[i]] for e, queue in queues.items()}
     said += _turns(trains, queues, joins, _open(_inside(joins, barred), stretches, granted), outside)
     _keep_places(trains, queues, joins, outside, outside if keeps is None else keeps, room, zone, by)
-    after = zones.following[row]
-    for i in np.flatnonzero(present & (after >= 0) & (begin[after] - s < reach)).tolist():  # not requested: it stands before
+    for i in np.flatnonzero(nearing).tolist():  # not requested: it stands before
         k = _limit(trains, granted, i)
         if k >= 0 and (i, int(edge[k])) not in granted and begin[k] - s[i] < min(reach[i], room[i]):
             room[i], zone[i], by[i] = max(begin[k] - s[i], 0.0), edge[k], -1
