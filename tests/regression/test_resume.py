@@ -286,7 +286,7 @@ def test_other_versions_another_scenario_and_damage_are_refused_in_words(tmp_pat
             resume(tmp_path / "run")
     text = (partial / "scenario.toml").read_text()
     (partial / "scenario.toml").write_text(text.replace("speed_mps = 85.0", "speed_mps = 84.0", 1))
-    with pytest.raises(InputError, match=r"scenario\.toml: damaged or changed"):
+    with pytest.raises(InputError, match=r"scenario\.toml: damaged, or changed since"):
         resume(partial)
     (partial / "scenario.toml").write_text(text)
     moves = partial / "checkpoint" / "moves.bin"

@@ -37,7 +37,7 @@ def test_a_run_does_not_count_what_it_compiled(tmp_path, monkeypatch: pytest.Mon
     from trainctl import runner
     from trainctl.scenario.build import open_scenario
 
-    real = runner.Loop
+    real = runner.loop_of
 
     def slow(*arguments: object) -> object:
         @njit
@@ -50,7 +50,7 @@ def test_a_run_does_not_count_what_it_compiled(tmp_path, monkeypatch: pytest.Mon
         return real(*arguments)  # type: ignore[arg-type]
 
     compiled: list[float] = []
-    monkeypatch.setattr(runner, "Loop", slow)
+    monkeypatch.setattr(runner, "loop_of", slow)
     began = time.perf_counter()
     done = runner.run(open_scenario("fully_distributed", {"run.duration_s": 16}), tmp_path / "r", "numeric")
     took = time.perf_counter() - began

@@ -27,6 +27,9 @@ STANDS_MPS = 0.05
 #: What is waited at; ``Wait.place`` is one of them.
 TRAIN, SWITCH, SIGNAL, ENTRY, TURN, PARKED = "train", "switch", "signal", "entry", "turn", "parked"
 
+#: A circle with a signal in it is told once it has lasted so long [s]: a red that has only just come may go again by itself.
+LASTS_S = 60.0
+
 
 class Wait(NamedTuple):
     """A train and one thing it waits for."""
@@ -145,7 +148,7 @@ class State(NamedTuple):
 
     since: Floats  # (n,) s, since when every train waits, NaN: it does not
     told: Bools  # (n,) whether that has been told
-    counted: dict[str, Any]  # circles: lists of trains; long: number of long waits
+    counted: dict[str, Any]  # circles: lists of trains; forming: since when those not told yet last [s]; long: number of long waits
 
 
 class Waiting:
@@ -156,7 +159,7 @@ class Waiting:
 
     def initial(self) -> State:
         """No train waits yet."""
-        return State(np.full(len(self.ids), np.nan), np.zeros(len(self.ids), bool), {"circles": [], "long": 0})
+        return State(np.full(len(self.ids), np.nan), np.zeros(len(self.ids), bool), {"circles": [], "forming": {}, "long": 0})
 
     def new(self, t: float, found: Sequence[Wait], due: Mapping[int, float], s: State) -> Iterator[tuple[str, dict[str, Any]]]:
         """Events at ``t`` [s], as kind and fields; ``due`` has the time since which trains wait that are to enter [s]."""
@@ -173,11 +176,17 @@ class Waiting:
             s.told[i] = True
             s.counted["long"] += 1
             yield "waiting", {**self._words(of[i]), "since_s": float(s.since[i])}
+        forming, s.counted["forming"] = s.counted["forming"], {}
         for circle in circles(found):
-            if circle not in s.counted["circles"]:
-                s.counted["circles"].append(circle)
-                inside = [w for w in found if w.train in circle and w.other in circle]
-                yield "gridlock", {"trains": [self.ids[i] for i in circle], "waits": [self._words(w) for w in inside]}
+            if circle in s.counted["circles"]:
+                continue
+            inside = [w for w in found if w.train in circle and w.other in circle]
+            since = forming.get(str(circle), t)
+            if any(w.place == SIGNAL for w in inside) and t - since < LASTS_S:
+                s.counted["forming"][str(circle)] = since
+                continue
+            s.counted["circles"].append(circle)
+            yield "gridlock", {"trains": [self.ids[i] for i in circle], "waits": [self._words(w) for w in inside]}
 
     def _words(self, wait: Wait) -> dict[str, Any]:
         return {

@@ -9,7 +9,7 @@ import pytest
 
 from trainctl.monitors import waiting
 from trainctl.monitors.outcome import Tally
-from trainctl.monitors.waiting import SWITCH, TRAIN, Wait, Waiting, circles
+from trainctl.monitors.waiting import LASTS_S, SIGNAL, SWITCH, TRAIN, Wait, Waiting, circles
 from trainctl.railway import supervisor
 from trainctl.railway.supervisor import Targets
 from trainctl.signals import Seen
@@ -66,6 +66,17 @@ def test_a_circle_is_told_once_and_another_one_too():
     assert list(watch.new(6.0, both, {}, s)) == []
     assert [kind for kind, _ in watch.new(8.0, both + waits((2, 3), (3, 2)), {}, s)] == ["gridlock"]
     assert s.counted["circles"] == [[0, 1], [2, 3]]
+
+
+def test_a_circle_with_a_signal_in_it_is_told_once_it_lasts():
+    """Red that has only just come may go again by itself; one that went and came back begins anew."""
+    told, found = Waiting(["a", "b"], ["e"], 600.0), [Wait(0, 1, 0, TRAIN), Wait(1, 0, 0, SIGNAL)]
+    s = told.initial()
+    assert list(told.new(10.0, found, {}, s)) == [] and list(told.new(10.0 + LASTS_S - 1.0, found, {}, s)) == []
+    assert list(told.new(75.0, found[:1], {}, s)) == [] and list(told.new(76.0, found, {}, s)) == []
+    [(kind, event)] = told.new(76.0 + LASTS_S, found, {}, s)
+    assert (kind, event["trains"]) == ("gridlock", ["a", "b"]) and s.counted["circles"] == [[0, 1]]
+    assert list(told.new(400.0, found, {}, s)) == []
 
 
 def test_a_long_wait_is_told_once_and_the_next_one_again():
