@@ -2,7 +2,7 @@
 
 railsim, the railway module of MATSim, has a single track of seven nodes on which a regional train, a freight train and a fast one run,
 each with an acceleration and a braking of its own, and states when they arrive. Those are closed sums of ways and rates, but for who
-waits. Ours keep a margin between trains that railsim does not: 15 m before what a train must not reach, and the station in the middle
+waits. Ours keep a margin between trains that railsim does not: 10 m before what a train must not reach, and the station in the middle
 is longer by as much as a train needs to stand clear there; the track before it is shorter by the same.
 """
 
