@@ -243,11 +243,11 @@ def test_a_hundred_trains_of_eight_run_faster_than_real_time(plant_under: str, t
         constants.acceleration[:] = 0.05
     loop = integrate.Inner(constants, none.Constants(), coupled_units.constants(coupled_units.Params(), scene.consists))
     own, estimate = scene.own.copy(), np.zeros((800, 0))
-    air = integrate.Air(np.zeros((len(scene.links.sender), part.MESSAGE)), live, False, 0.0)
+    received = integrate.Received(np.zeros((len(scene.links.sender), part.MESSAGE)), live, False, 0.0)
     work = integrate.scratch(own, estimate, 100, 0, part.MESSAGE)
     extremes = Extremes.fresh(100, 800, len(part.WATCHED))
     arguments = (
-        loop, scene.consists.first, scene.consists.length, scene.links, References.one(scene.reference, len(scene.trains)), air, 0.0, 0.01, 100, np.zeros(0), own,
+        loop, scene.consists.first, scene.consists.length, scene.links, References.one(scene.reference, len(scene.trains)), received, 0.0, 0.01, 100, np.zeros(0), own,
         estimate, work, extremes,
     )  # fmt: skip
     parts = integrate.compiled(part, none, coupled_units, arguments)

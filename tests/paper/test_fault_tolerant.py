@@ -66,7 +66,7 @@ def small_steps(every: float, duration: float) -> tuple[Example, list[np.ndarray
     law_constants, observer = law.constants(run.params, s), asymptotic.constants(asymptotic.Params(), s)
     loop = integrate.Inner(law_constants, observer, plant.constants(NOISY, s.consists, trains=s.trains))
     own, estimate = s.own.copy(), asymptotic.initial(asymptotic.Params(), s.own)
-    air = integrate.Air(np.zeros((2, law.MESSAGE)), True, True, 0.0)
+    received = integrate.Received(np.zeros((2, law.MESSAGE)), True, True, 0.0)
     work, extremes = integrate.scratch(own, estimate, 3, 5, 4), Extremes.fresh(3, 9, 3)
     c, n = s.consists, round(every / 0.002)
     arguments = (
@@ -75,7 +75,7 @@ def small_steps(every: float, duration: float) -> tuple[Example, list[np.ndarray
         c.length,
         s.links,
         References.one(s.reference, len(s.trains)),
-        air,
+        received,
         0.0,
         0.002,
         n,
@@ -95,7 +95,7 @@ def small_steps(every: float, duration: float) -> tuple[Example, list[np.ndarray
             c.length,
             s.links,
             References.one(s.reference, len(s.trains)),
-            air,
+            received,
             k * every,
             0.002,
             n,

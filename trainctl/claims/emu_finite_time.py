@@ -108,14 +108,14 @@ def run(scene: Scene, seconds: int, params: law.Params | None = None, step: floa
     loop = integrate.Inner(
         law.constants(params, scene), none.Constants(), coupled_units.constants(coupled_units.Params(), scene.consists)
     )
-    air = integrate.Air(np.zeros((len(links.sender), law.MESSAGE)), period is None, False, 0.0)
+    received = integrate.Received(np.zeros((len(links.sender), law.MESSAGE)), period is None, False, 0.0)
     work = integrate.scratch(own, estimate, len(scene.trains), none.CORRECTIONS, law.MESSAGE)
     extremes = Extremes.fresh(len(scene.trains), len(own), len(law.WATCHED))
     first, length, references = scene.consists.first, scene.consists.length, References.one(scene.reference, len(scene.trains))
     breaks = scene.reference.breaks[1:-1].copy()
 
     def arguments(t: float, n: int) -> tuple[object, ...]:
-        return loop, first, length, links, references, air, t, step, n, breaks, own, estimate, work, extremes
+        return loop, first, length, links, references, received, t, step, n, breaks, own, estimate, work, extremes
 
     parts = integrate.compiled(law, none, coupled_units, arguments(0.0, 1))
     states = np.empty((seconds + 1, *own.shape))
@@ -125,9 +125,9 @@ def run(scene: Scene, seconds: int, params: law.Params | None = None, step: floa
     for k in range(round(seconds / share)):
         t = k * share
         if period is not None and k % round(period / share) == 0:
-            integrate.exchange(parts, loop, first, links, references, air, t, own, estimate, work)
-            air.heard[:] = work.sent[links.sender]
-            air = air._replace(sent_at=t)
+            integrate.exchange(parts, loop, first, links, references, received, t, own, estimate, work)
+            received.heard[:] = work.sent[links.sender]
+            received = received._replace(sent_at=t)
         integrate.advance(parts, *arguments(t, round(share / step)))  # type: ignore[arg-type]
         if (k + 1) % round(1.0 / share) == 0:
             states[round((k + 1) * share)] = own

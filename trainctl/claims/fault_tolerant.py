@@ -110,7 +110,7 @@ class Example:
         moving = plant.constants(NOISY, c, faults=self.faults, trains=s.trains)
         loop = integrate.Inner(law_constants, observer_constants, moving)
         own, estimate = s.own.copy(), observer.initial(observer_params, s.own)
-        air = integrate.Air(np.zeros((2, law.MESSAGE)), self.period is None, True, 0.0)
+        received = integrate.Received(np.zeros((2, law.MESSAGE)), self.period is None, True, 0.0)
         work = integrate.scratch(own, estimate, 3, observer.CORRECTIONS, law.MESSAGE)
         self.extremes = Extremes.fresh(3, 9, 3)
         references = References.one(s.reference, len(s.trains))
@@ -120,7 +120,7 @@ class Example:
         n = round(chunk / h)
         parts = integrate.compiled(
             law, observer, plant,
-            (loop, c.first, c.length, s.links, references, air, 0.0, h, n, split, own, estimate, work, self.extremes),
+            (loop, c.first, c.length, s.links, references, received, 0.0, h, n, split, own, estimate, work, self.extremes),
         )  # fmt: skip
         history: list[tuple[Any, ...]] = []
         for k in range(round(duration / chunk)):
@@ -129,16 +129,16 @@ class Example:
                 plant.make_noise(NOISY, moving, self.seed, round(t / NOISY.noise_hold_s))
             if self.period and k % round(self.period / chunk) == 0:  # nothing has been heard yet at the start: the exact chain
                 integrate.exchange(
-                    parts, loop, c.first, s.links, references, air._replace(live=k == 0), t, own, estimate, work
+                    parts, loop, c.first, s.links, references, received._replace(live=k == 0), t, own, estimate, work
                 )  # fmt: skip
-                air.heard[:] = work.sent[s.links.sender]
-                air = air._replace(sent_at=t)
+                received.heard[:] = work.sent[s.links.sender]
+                received = received._replace(sent_at=t)
             if k % round(every / chunk) == 0:
                 history.append(
                     (t, own.copy(), observer.acceleration_estimate(observer_constants, estimate).copy(), observer.fault_estimate(observer_constants, estimate))
                 )  # fmt: skip
             applied = integrate.advance(
-                parts, loop, c.first, c.length, s.links, references, air, t, h, n, split, own, estimate, work, self.extremes
+                parts, loop, c.first, c.length, s.links, references, received, t, h, n, split, own, estimate, work, self.extremes
             )
             if k % round(every / chunk) == 0:
                 history[-1] += (plant.fault(moving, t, applied),)

@@ -66,8 +66,8 @@ class Inner(NamedTuple):
     orders: Orders = NO_ORDERS
 
 
-class Air(NamedTuple):
-    """Messages between trains."""
+class Received(NamedTuple):
+    """What links brought, as the kernels take it: of ``Messages`` the newest."""
 
     heard: Floats  # (L, w) what each link brought
     live: bool  # True: neighbours' data are those of this very instant (the papers); False: ``heard`` is held
@@ -122,7 +122,7 @@ def add(lift, sign, a, b, applied):  # type: ignore[no-untyped-def]
 
 
 @bare(cache=False)
-def stage(code, loop, first, links, references, air, t, inside, own, estimate, work, low, high):  # type: ignore[no-untyped-def]
+def stage(code, loop, first, links, references, received, t, inside, own, estimate, work, low, high):  # type: ignore[no-untyped-def]
     """Evaluate the closed loop of trains ``low`` to ``high`` at one instant: fills ``work`` with forces and rates.
 
     The weight along the track is known and made up for: it is added to what the law demands, within the limits. Observers, which
@@ -133,8 +133,8 @@ def stage(code, loop, first, links, references, air, t, inside, own, estimate, w
     limit, rate = part(code, PLANT, "limit"), part(code, PLANT, "rate")
     observed = estimate.shape[1] > 0
     follows = -1  # whose reference ``work.leader`` is
-    age = 0.0 if air.live else t - air.sent_at
-    held, lift, talk = loop.orders.held.acceleration, loop.orders.lift, talking(air)
+    age = 0.0 if received.live else t - received.sent_at
+    held, lift, talk = loop.orders.held.acceleration, loop.orders.lift, talking(received)
     ordered = len(held) > 0
     for i in range(low, high):
         a, b = first[i], first[i + 1]
@@ -150,7 +150,7 @@ def stage(code, loop, first, links, references, air, t, inside, own, estimate, w
                 for j in range(len(x)):
                     still[j] = x[j, SPEED] < 0.0 or (x[j, SPEED] == 0.0 and x_rate[j, SPEED] <= 0.0)
             correction(i, loop.observer, x, q, still, block(code, CORRECTION, work.correction, a, b))
-        if talk and not air.chain:
+        if talk and not received.chain:
             follows = lead(i, follows, references, t, inside, work.leader)
             q_rate = block(code, ESTIMATE, work.estimate_rate, a, b)
             message(i, loop.law, work.leader, links.slot[i], x, q, q_rate, work.sent[i])
@@ -163,15 +163,15 @@ def stage(code, loop, first, links, references, air, t, inside, own, estimate, w
         corrected = block(code, CORRECTION, work.correction, a, b)
         if talk:
             for k in range(e, f):
-                for w in range(air.heard.shape[1]):
-                    air.heard[k, w] = work.sent[links.sender[k], w]
+                for w in range(received.heard.shape[1]):
+                    received.heard[k, w] = work.sent[links.sender[k], w]
         follows = lead(i, follows, references, t, inside, work.leader)
         demand(
-            i, loop.law, work.leader, age, links.slot[i], x, q, corrected, links.desired[e:f], air.heard[e:f], applied,
+            i, loop.law, work.leader, age, links.slot[i], x, q, corrected, links.desired[e:f], received.heard[e:f], applied,
         )  # fmt: skip
         if ordered and held[i] == held[i]:  # not NaN
             shared.demand(
-                i, loop.orders.held, work.leader, age, 0.0, x, q, corrected, links.desired[e:f], air.heard[e:f], applied,
+                i, loop.orders.held, work.leader, age, 0.0, x, q, corrected, links.desired[e:f], received.heard[e:f], applied,
             )  # fmt: skip
         else:
             add(lift, 1.0, a, b, work.applied)
@@ -180,16 +180,16 @@ def stage(code, loop, first, links, references, air, t, inside, own, estimate, w
             add(lift, -1.0, a, b, work.applied)
             estimate_rate(i, loop.observer, x, q, block(code, UNITS, work.held, a, b), corrected, applied, q_rate)
             add(lift, 1.0, a, b, work.applied)
-        if talk and air.chain:
+        if talk and received.chain:
             message(i, loop.law, work.leader, links.slot[i], x, q, q_rate, work.sent[i])
         rate(i, loop.plant, t, inside, x, applied, x_rate, work.power[i])
 
 
 @bare()
-def exchange_kernel(code, loop, first, links, references, air, t, own, estimate, work):  # type: ignore[no-untyped-def]
+def exchange_kernel(code, loop, first, links, references, received, t, own, estimate, work):  # type: ignore[no-untyped-def]
     """See ``exchange``."""
     message = part(code, LAW, "message")
-    stage(code, loop, first, links, references, air, t, t, own, estimate, work, 0, len(first) - 1)
+    stage(code, loop, first, links, references, received, t, t, own, estimate, work, 0, len(first) - 1)
     follows = -1
     for i in range(len(first) - 1):
         a, b = first[i], first[i + 1]
@@ -242,25 +242,25 @@ def copy(out, table):  # type: ignore[no-untyped-def]
 
 
 @bare(inline="always")
-def talking(air):  # type: ignore[no-untyped-def]
+def talking(received):  # type: ignore[no-untyped-def]
     """Whether trains receive from each other within a stretch of integration."""
-    return air.live and air.heard.shape[1] > 0
+    return received.live and received.heard.shape[1] > 0
 
 
 @bare()
 def advance_kernel(  # type: ignore[no-untyped-def]
-    code, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes, blocks
+    code, loop, first, length, links, references, received, t, h, n, breaks, own, estimate, work, extremes, blocks
 ):  # fmt: skip
     """See ``advance``. ``blocks`` are the trains that blocks begin with, and the one behind the last: each stays in the cache."""
     for k in range(len(blocks) - 1):
         stretch(
-            code, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes, blocks[k],
+            code, loop, first, length, links, references, received, t, h, n, breaks, own, estimate, work, extremes, blocks[k],
             blocks[k + 1],
         )  # fmt: skip
 
 
 @bare(cache=False)
-def stretch(code, loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes, low, high):  # type: ignore[no-untyped-def]
+def stretch(code, loop, first, length, links, references, received, t, h, n, breaks, own, estimate, work, extremes, low, high):  # type: ignore[no-untyped-def]
     """Integrate trains ``low`` to ``high``."""
     a, b = first[low], first[high]
     x, q, energy, power = own[a:b], estimate[a:b], extremes.energy[low:high], work.power[low:high]
@@ -282,7 +282,9 @@ def stretch(code, loop, first, length, links, references, air, t, h, n, breaks, 
                 if s > 0:
                     along(x, x_0, ahead, x_rate)
                     along(q, q_0, ahead, q_rate)
-                stage(code, loop, first, links, references, air, begin + ahead, begin + 0.5 * dt, own, estimate, work, low, high)
+                stage(
+                    code, loop, first, links, references, received, begin + ahead, begin + 0.5 * dt, own, estimate, work, low, high
+                )
                 if s == 0:
                     see(
                         code, loop, first, length, links, references, begin, begin + 0.5 * dt, own, work, extremes, low, high
@@ -352,7 +354,9 @@ def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...], ex
     code = f"{described(law, observer, plant)} {numbers(first, own, estimate, work.correction)}"
     if config.DISABLE_JIT:
         return Parts(code, advance_kernel, exchange_kernel)
-    loop, first, length, links, references, air, t, h, n, breaks, own, estimate, work, extremes = (typeof(a) for a in arguments)
+    loop, first, length, links, references, received, t, h, n, breaks, own, estimate, work, extremes = (
+        typeof(a) for a in arguments
+    )
     text = types.literal(code)
     to_advance = (
         text,
@@ -361,7 +365,7 @@ def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...], ex
         length,
         links,
         references,
-        air,
+        received,
         t,
         h,
         n,
@@ -372,7 +376,7 @@ def compiled(law: Any, observer: Any, plant: Any, arguments: tuple[Any, ...], ex
         extremes,
         typeof(np.zeros(0, np.int64)),
     )
-    to_exchange = (text, loop, first, links, references, air, t, own, estimate, work)
+    to_exchange = (text, loop, first, links, references, received, t, own, estimate, work)
     place = hashlib.sha256(" ".join(m.__file__ for m in (law, observer, plant)).encode()).hexdigest()[:16]
     exchange = from_cache(exchange_kernel, place, to_exchange) if exchanges else exchange_kernel
     return Parts(code, from_cache(advance_kernel, place, to_advance), exchange)
@@ -393,7 +397,8 @@ def from_cache(kernel: Any, place: str, arguments: tuple[Any, ...]) -> Callable[
 
 
 def advance(
-    parts: Parts, loop: Inner, first: Ints, length: Floats, links: Links, references: References, air: Air, t: float, h: float,
+    parts: Parts, loop: Inner, first: Ints, length: Floats, links: Links, references: References, received: Received,
+    t: float, h: float,
     n: int, breaks: Floats, own: Floats, estimate: Floats, work: Scratch, extremes: Extremes, shares: Shares = ALONE,
 ) -> Floats:  # fmt: skip
     """Integrate ``own`` and ``estimate`` in place over ``n`` classic Runge-Kutta steps of ``h`` seconds from ``t``.
@@ -410,17 +415,29 @@ def advance(
         assert shares.pool is not None
         space = {name: getattr(loop.law, name).copy() for name in shares.space}
         apart = loop._replace(law=loop.law._replace(**space)) if space else loop
-        arguments = (apart, first, length, links, references, air, *over_it, work._replace(leader=np.zeros(4)), extremes, blocks)
+        arguments = (
+            apart,
+            first,
+            length,
+            links,
+            references,
+            received,
+            *over_it,
+            work._replace(leader=np.zeros(4)),
+            extremes,
+            blocks,
+        )
         further.append(shares.pool.submit(parts.advance, parts.code, *arguments))
-    parts.advance(parts.code, loop, first, length, links, references, air, *over_it, work, extremes, mine)
+    parts.advance(parts.code, loop, first, length, links, references, received, *over_it, work, extremes, mine)
     for one in further:
         one.result()
     return work.applied_first.copy()
 
 
 def exchange(
-    parts: Parts, loop: Inner, first: Ints, links: Links, references: References, air: Air, t: float, own: Floats, estimate: Floats,
+    parts: Parts, loop: Inner, first: Ints, links: Links, references: References, received: Received,
+    t: float, own: Floats, estimate: Floats,
     work: Scratch,
 ) -> None:  # fmt: skip
     """Fill ``work.sent`` with what every train sends at ``t``, each from what it had heard until then."""
-    parts.exchange(parts.code, loop, first, links, references, air, t, own, estimate, work)
+    parts.exchange(parts.code, loop, first, links, references, received, t, own, estimate, work)

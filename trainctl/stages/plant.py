@@ -213,11 +213,12 @@ class Units:
             heard=np.zeros((len(links.sender), self.law.MESSAGE)), sent_at=0.0, counted=-1,
         )  # fmt: skip
         self.shares = self._shared(links)
-        loop, air = self._loop(constants, now), self._air(now)
+        loop, received = self._loop(constants, now), self._received(now)
         references = References.one(p.reference, len(self.masses))
         self.parts = integrate.compiled(
             self.law, p.observer, p.plant,
-            (loop, p.consists.first, p.consists.length, links, references, air, 0.0, self.h, 1, self.breaks, p.own, now.estimate,
+            (loop, p.consists.first, p.consists.length, links, references, received,
+             0.0, self.h, 1, self.breaks, p.own, now.estimate,
              now.work, now.extremes),
             exchanges=self.period is not None,
         )  # fmt: skip
@@ -237,8 +238,8 @@ class Units:
     def _loop(self, constants: Any, state: State) -> integrate.Inner:
         return integrate.Inner(self.told if self.p.sampled else constants, state.observer, self.plant, self.orders)
 
-    def _air(self, state: State) -> integrate.Air:
-        return integrate.Air(state.heard, self.period is None, self.law.ORDER == "chain", state.sent_at)
+    def _received(self, state: State) -> integrate.Received:
+        return integrate.Received(state.heard, self.period is None, self.law.ORDER == "chain", state.sent_at)
 
     def step(
         self, k: int, t: float, own: Floats, demand: Demand, ordered: Floats, formed: Formed, messages: Messages, state: State,
@@ -258,7 +259,11 @@ class Units:
             self.orders.lift[:] = p.consists.mass * self._climbing(own)
         self._disturb(disturbed)
         assert formed.links is not None
-        loop, air, links = self._loop(formed.constants, state), self._air(state), formed.links._replace(order=self.shares.order)
+        loop, received, links = (
+            self._loop(formed.constants, state),
+            self._received(state),
+            formed.links._replace(order=self.shares.order),
+        )
         moved = own.copy()
         moved[:, SPEED] += np.repeat(disturbed.speed, np.diff(first))
         began = moved.copy()
@@ -266,13 +271,14 @@ class Units:
         demanded = None
         for begin, sub_steps in self._pieces(t):
             if self.period is not None and (number := math.floor(begin / self.period + 1e-6)) != counted:
-                messages, air = self._exchange(
-                    loop, formed.references, air, begin, number, counted < 0, moved, links, messages, state
+                messages, received = self._exchange(
+                    loop, formed.references, received, begin, number, counted < 0, moved, links, messages, state
                 )
                 counted = number
             self._make_noise(begin, calm)
             applied = integrate.advance(
-                self.parts, loop, first, p.consists.length, links, formed.references, air, begin, self.h, sub_steps, self.breaks,
+                self.parts, loop, first, p.consists.length, links, formed.references, received,
+                begin, self.h, sub_steps, self.breaks,
                 moved, state.estimate, state.work, state.extremes, self.shares,
             )  # fmt: skip
             demanded = applied if demanded is None else demanded
@@ -292,7 +298,7 @@ class Units:
             asked=asked, limited=state.extremes.limited > limited, clipped=clipped,
             force=force, extras=extras,
         )  # fmt: skip
-        return Moved(moved, motion, messages, state._replace(heard=air.heard, sent_at=air.sent_at, counted=counted))
+        return Moved(moved, motion, messages, state._replace(heard=received.heard, sent_at=received.sent_at, counted=counted))
 
     def _asked(self, began: Floats, moved: Floats, way: Floats, calm: bool) -> Floats:
         """Acceleration that drives every train over the step [m/s2], (n,); NaN where it stops harder than full braking.
@@ -393,22 +399,22 @@ class Units:
         return [(t + a * self.h, b - a) for a, b in pairwise([*starts, self.sub_steps])]
 
     def _exchange(
-        self, loop: integrate.Inner, references: References, air: integrate.Air, t: float, number: int, first_time: bool,
+        self, loop: integrate.Inner, references: References, received: integrate.Received, t: float, number: int, first_time: bool,
         own: Floats, links: Links, messages: Messages, state: State,
-    ) -> tuple[Messages, integrate.Air]:  # fmt: skip
+    ) -> tuple[Messages, integrate.Received]:  # fmt: skip
         """Send and receive at ``t``. A link opens with a message that arrives.
 
         On a new edge list nothing has been heard yet: the first messages are those of one common instant.
         """
         first, sent = self.p.consists.first, state.work.sent
-        live = air._replace(live=True) if first_time else air
+        live = received._replace(live=True) if first_time else received
         integrate.exchange(self.parts, loop, first, links, references, live, t, own, state.estimate, state.work)
         position = own[self.p.leading, POSITION]
         place = position - references.leader(t)[POSITION]
         messages, _ = exchange.deliver(self.radio, messages, sent.copy(), position, links, number, t, place)
         fresh = ~messages.ever
         messages.heard[fresh] = sent[links.sender[fresh]]
-        return messages, air._replace(heard=messages.heard.copy(), sent_at=t)
+        return messages, received._replace(heard=messages.heard.copy(), sent_at=t)
 
     def _make_noise(self, t: float, calm: bool) -> None:
         """Overwrite the plant's noise with the sample at ``t``, or with none."""

@@ -36,7 +36,7 @@ class Rig:
         self.own, self.estimate = s.own.copy(), np.zeros((len(s.own), 0))
         plant = coupled_units.constants(coupled_units.Params(), s.consists)
         self.loop = integrate.Inner(constants, none.Constants(), plant)
-        self.air = integrate.Air(np.zeros((len(s.links.sender), part.MESSAGE)), live, False, 0.0)
+        self.received = integrate.Received(np.zeros((len(s.links.sender), part.MESSAGE)), live, False, 0.0)
         self.work = integrate.scratch(self.own, self.estimate, len(s.trains), none.CORRECTIONS, part.MESSAGE)
         self.extremes = Extremes.fresh(len(s.trains), len(s.own), len(part.WATCHED))
         self.breaks = np.array(breaks)
@@ -45,7 +45,7 @@ class Rig:
     def _arguments(self, t: float, h: float, n: int) -> tuple[Any, ...]:
         c = self.scene.consists
         return (
-            self.loop, c.first, c.length, self.scene.links, References.one(self.scene.reference, len(self.scene.trains)), self.air, t, h, n, self.breaks, self.own,
+            self.loop, c.first, c.length, self.scene.links, References.one(self.scene.reference, len(self.scene.trains)), self.received, t, h, n, self.breaks, self.own,
             self.estimate, self.work, self.extremes,
         )  # fmt: skip
 
@@ -60,7 +60,7 @@ class Rig:
             c.first,
             self.scene.links,
             References.one(self.scene.reference, len(self.scene.trains)),
-            self.air,
+            self.received,
             t,
             self.own,
             self.estimate,
@@ -217,19 +217,19 @@ def test_held_messages_are_those_of_the_last_exchange() -> None:
         table = np.zeros((0, 0))
         law.message(i, rig.loop.law, np.array([10e3, 80.0, 0.0, 0.0]), 0.0, rig.own[rows], table, table, message[i])
     assert np.array_equal(rig.work.sent, message)
-    rig.air.heard[:] = rig.work.sent[rig.scene.links.sender]
-    rig.air.heard[:, law.TAIL_SPEED] -= 3.0  # what was heard is not what is
+    rig.received.heard[:] = rig.work.sent[rig.scene.links.sender]
+    rig.received.heard[:, law.TAIL_SPEED] -= 3.0  # what was heard is not what is
     rig.own[:3, 1] += 1.0
-    kept = rig.air.heard.copy()
+    kept = rig.received.heard.copy()
     applied = rig.advance(0.0, 0.005, 2)
-    assert np.array_equal(rig.air.heard, kept)
+    assert np.array_equal(rig.received.heard, kept)
     drag = 8e4 * (0.01176 + (7.7616e-4 + 1.6e-5 * 80.0) * 80.0)
     assert applied[3] == pytest.approx(drag - 8e4 * 3.0 ** (2 * 0.9 / 1.9))
 
 
 def test_live_messages_are_those_of_this_instant() -> None:
     rig = cruising()
-    rig.air.heard[:] = np.nan
+    rig.received.heard[:] = np.nan
     rig.own[:3, 1] += 1.0
     applied = rig.advance(0.0, 0.005, 1)
     drag = 8e4 * (0.01176 + (7.7616e-4 + 1.6e-5 * 80.0) * 80.0)
