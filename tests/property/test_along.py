@@ -258,7 +258,7 @@ def test_tails_behind_the_beginning_foul_what_they_would_lie_on_and_across(seed,
     rng = np.random.default_rng(seed)
     railway = random_railway(rng, False)
     traffic, _ = random_traffic(rng, railway, n)
-    found = in_the_way.fouling(along.places(traffic[0], along.net(railway), *traffic[1:], 100.0))
+    found = in_the_way.fouling(along.places(traffic[0], along.net(railway), *traffic[1:], 100.0), np.zeros(len(traffic[1]), bool))
     for i in range(n):
         tail = [(e, max(depth - traffic[3][i], 0.0)) for e, depth, k, _ in bodies(railway, traffic, i) if k < 0]
         others = [piece for j in set(range(n)) - {i} for piece in occupied(railway, traffic, j)]

@@ -171,3 +171,16 @@ def test_a_sign_may_show_more_than_the_net_where_a_train_enters(tmp_path):
     config.write_text(config.read_text().replace("</input>", '<additional-files value="a.add.xml"/></input>'))
     done = in_sumo(scenario(tmp_path, 90), tmp_path / "run")
     assert done.ok and done.trains.speed_mps.iloc[0] > 25.0
+
+
+def test_two_that_were_parked_side_by_side_come_back_one_after_the_other(tmp_path):
+    """Their platforms are apart, their rears are not: both lie on the track before."""
+    halts = [f'<stop lane="p{k}_0" endPos="60" duration="10" until="600" parking="true"/>' for k in (1, 2)]
+    body = "".join(nets.train(f"t{k}", f"up p{k} -p{k} down", 100 * k, halt) for k, halt in enumerate(halts, 1))
+    nets.platforms(tmp_path, body)
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(nets.scenario("robust_constrained", 1300)))
+    found = run(open_scenario(str(tmp_path / "s.toml")), tmp_path / "out", "numeric")
+    left = {e["train"]: e["time_s"] for e in found.events if e["kind"] == "stop_left"}
+    assert [e for e in found.events if e["kind"] == "violation"] == [] and found.ok
+    arrived = [e["train"] for e in found.events if e["kind"] == "arrive"]
+    assert sorted(arrived) == ["t1", "t2"] and len(left) == 2

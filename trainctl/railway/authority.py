@@ -32,12 +32,13 @@ class View(NamedTuple):
     limits: Limits
     room: Floats  # (n,) m, to the body on the own way that surely is there; inf: none
     body: Ints  # (n,) whose it is, -1: none
-    fouling: Bools  # (n,) its tail lies on another train behind the beginning of its way, see ``railway.bodies``
+    fouling: Bools  # (n,) it lies on another train, where none came up to it, see ``railway.bodies``
 
 
 def look(
     ways: Ways, net: along.Net, limit: Floats, falls: Bools, factor: Floats, row: Ints, s: Floats, speed: Floats, length: Floats,
     present: Bools, horizon: float, held: Floats, order: along.Order | None, internal: Bools, at: int = SWITCH,
+    back: Bools | None = None,
 ) -> View:  # fmt: skip
     """Look ahead along the ways of all trains.
 
@@ -65,6 +66,8 @@ def look(
         Edges inside junctions: whoever keeps a join clear stands before its junction.
     at : int
         What trains are held at: place in ``supervisor.KINDS``.
+    back : ndarray of bool, shape (n,), optional
+        Trains that are to come back from where they were parked, see ``bodies.fouling``.
 
     Returns
     -------
@@ -80,7 +83,9 @@ def look(
     real = far_first[(there.sense[far_first] != 0) & there.sure[far_first]]
     room[there.train[real]], body[there.train[real]] = there.room[real], there.other[real]  # the nearest is written last
     limits = Limits(*_limits(ways, limit, falls, factor, row, s, length, present, horizon))
-    return View(along.ahead(placed), targets, clear, limits, room, body, fouling(placed))
+    return View(
+        along.ahead(placed), targets, clear, limits, room, body, fouling(placed, np.zeros(len(row), bool) if back is None else back)
+    )
 
 
 def _short(there: Bodies, ways: Ways, net: along.Net, internal: Bools, row: Ints, s: Floats) -> Bodies:

@@ -87,16 +87,17 @@ def obstacles(places: Places, virtual: bool = True) -> Obstacles:
     return Obstacles(room, train, sense)
 
 
-def fouling(places: Places) -> Bools:
+def fouling(places: Places, back: Bools) -> Bools:
     """Whether the tail of each train lies, or may lie, on another or across its track, behind the beginning of its way; (n,).
 
-    No train comes up to such a tail: its train was put there. So it is to be asked before a train is.
+    No train comes up to such a tail: its train was put there. So it is to be asked before a train is. Of trains that come ``back``
+    (n,) from where they were parked all of the body counts, for the same reason.
     """
     found = np.zeros(len(places.row), bool)
-    for p in np.flatnonzero(places.piece_row < 0).tolist():
+    for p in np.flatnonzero((places.piece_row < 0) | back[places.piece_train]).tolist():
         i = places.piece_train[p]
         e = int(np.searchsorted(places.piece_first, p, side="right")) - 1
-        begin, end = max(places.depth[p] - places.length[i], 0.0), places.size[e]
+        begin, end = max(places.depth[p] - places.length[i], 0.0), min(places.depth[p], places.size[e])
         crossed = places.cross[places.cross_first[e] : places.cross_first[e + 1]].tolist()
         for f in (e, *crossed, *([int(places.twin[e])] if places.twin[e] >= 0 else [])):
             there = slice(places.piece_first[f], places.piece_first[f + 1])

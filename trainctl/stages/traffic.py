@@ -490,5 +490,5 @@ class Traffic:
         return authority.look(
             ways, self.net, self.limit, self.falls, self.roster.speed_factor, seen.row, seen.position,
             np.where(self.roster.driven, 0.0, speed), self.length, seen.present, horizon, held.room, order,
-            self.p.rails.internal, supervisor.SIGNAL if self.p.obeys else supervisor.SWITCH,
+            self.p.rails.internal, supervisor.SIGNAL if self.p.obeys else supervisor.SWITCH, s.parked,
         )  # fmt: skip
