@@ -18,6 +18,8 @@ SIGNS = np.array([1.0, -1.0, -1.0, -1.0, -1.0, 1.0])
 
 #: Share of the stored energy that is rounding.
 ROUNDING = 1e-9
+#: Less energy than this is none [J].
+TINY_J = 1e-6
 
 
 class State(NamedTuple):
@@ -69,7 +71,7 @@ class Balance:
             s.turnover[known] += np.abs(row.extremes.energy).sum(axis=1)[known]
             out = np.abs(s.drift) > self.LIMIT * s.turnover + ROUNDING * now
             for i in np.flatnonzero(out).tolist():
-                yield i, float(s.drift[i] / max(s.turnover[i], ROUNDING * now[i]))
+                yield i, float(s.drift[i] / max(s.turnover[i], ROUNDING * now[i], TINY_J))
         if row.disturbed is not None and row.disturbed.speed.any():
             kick = np.repeat(row.disturbed.speed, self.units)
             s.kicked[:] += np.add.reduceat(self.inertia * (row.own[:, SPEED] + 0.5 * kick) * kick, self.leading)

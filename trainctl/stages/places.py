@@ -6,6 +6,7 @@ import numpy as np
 
 from trainctl.railway import authority, supervisor
 from trainctl.railway.authority import View
+from trainctl.railway.supervisor import Targets
 from trainctl.scenario.model import Model
 from trainctl.signals import Bools, Floats
 
@@ -34,7 +35,7 @@ class Room:
         behind = view.targets.other == i
         if not behind.any():
             return False
-        asked, clear = authority.of(view.targets, behind), authority.of(view.clear, view.clear.other == i)
+        asked, clear = (_as_fast(authority.of(t, t.other == i), entry) for t in (view.targets, view.clear))
         seen = authority.judge(
             self.rules, trial, asked, clear, supervisor.no_limits(), self.step_s, self.theta, self.assumed, np.zeros(len(speed))
         )
@@ -46,6 +47,11 @@ class Room:
         if np.any(ahead.room < self.rules.margin_m) or view.fouling[i] or np.any(view.clear.room[view.clear.other == i] < 0.0):
             return False
         return not self.startles(i, 0.0, speed, view)
+
+
+def _as_fast(targets: Targets, speed: float) -> Targets:
+    """Rows of one train that runs with ``speed`` once it is there, whatever was believed of it before."""
+    return targets._replace(speed=np.where(targets.kind == supervisor.TRAIN, speed, targets.speed))
 
 
 def meets(view: View, i: int, guests: Bools) -> bool:

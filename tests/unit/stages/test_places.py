@@ -44,6 +44,7 @@ def test_who_stands_is_not_startled_and_who_runs_near_is(room):
     assert not room.startles(COMES, 0.0, speeds(0.0), behind(50.0))
     assert room.startles(COMES, 0.0, speeds(80.0), behind(50.0))
     assert not room.startles(COMES, 80.0, speeds(80.0), behind(2000.0, v=80.0))  # it runs as fast
+    assert room.startles(COMES, 0.0, speeds(80.0), behind(2000.0, v=80.0))  # it was to, and comes at a stand
     assert not room.startles(COMES, 0.0, speeds(80.0), behind(50.0, other=2))  # that is another one's tail
 
 
