@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gzip
+import os
+import re
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -230,3 +232,13 @@ class _Comments:
         rest = rest[: len(rest) - keep]
         out.append(rest.translate(self.BLANKS) if self.inside else rest)
         return b"".join(out)
+
+
+def ended(path: Path) -> bool:
+    """Whether a log has its end: SUMO does not tell when it could not write on."""
+    if not path.is_file() or path.stat().st_size < 4:
+        return False
+    with path.open("rb") as file:
+        file.seek(-min(path.stat().st_size, 200), os.SEEK_END)
+        end = file.read()
+    return end.endswith(b"PAR1") if path.suffix == ".parquet" else re.search(rb"(</[\w-]+>|/>)\s*$", end) is not None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 import sys
 from collections import deque
@@ -19,7 +18,7 @@ from trainctl.errors import CouplingError, SimulatorError
 from trainctl.numeric import LEAVES_M, lay_out, way_lengths
 from trainctl.railway.turning import inside
 from trainctl.railway.ways import Ways, rerouted, turned
-from trainctl.runs.sumo_logs import elements
+from trainctl.runs.sumo_logs import elements, ended
 from trainctl.signals import Bools, Floats, Ints, Links, Seen, Start
 from trainctl.sumo.causes import SPEED_MODE_FREE, cause
 from trainctl.sumo.commanded_files import HELD_S, LOGS, arrival_word, normal, write_configuration, write_routes
@@ -117,7 +116,7 @@ class Session:
         if self.began:
             self.began = False
             self.api.close()
-            torn = [name for key, name in self.logs.items() if key != "log" and not _ended(self.folder / name)]
+            torn = [name for key, name in self.logs.items() if key != "log" and not ended(self.folder / name)]
             if torn:
                 raise SimulatorError(f"SUMO left {', '.join(torn)} incomplete and gave no reason: is the disk full?")
 
@@ -489,13 +488,3 @@ def _direct(function: Any, domain: str = "vehicle") -> Any:
     """Find the compiled function that a function of libsumo hands its arguments on to: handing on takes a third of a call."""
     compiled = getattr(sys.modules.get(function.__module__), "_libsumo", None)
     return getattr(compiled, f"{domain}_{function.__name__}", function)
-
-
-def _ended(path: Path) -> bool:
-    """Whether a log has its end: SUMO does not tell when it could not write on."""
-    if not path.is_file() or path.stat().st_size < 4:
-        return False
-    with path.open("rb") as file:
-        file.seek(-min(path.stat().st_size, 200), os.SEEK_END)
-        end = file.read()
-    return end.endswith(b"PAR1") if path.suffix == ".parquet" else re.search(rb"(</[\w-]+>|/>)\s*$", end) is not None
