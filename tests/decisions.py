@@ -117,7 +117,7 @@ def played(plan: Plan, seed: int, reach: float = 300.0, rounds: int = 4000) -> i
             first.setdefault(int(ways.edge[ways.first[i]]), i)
         entering = np.zeros(n, bool)
         entering[list(first.values())] = True
-        state, held, _ = interlocking.request(
+        state, ends, _ = interlocking.request(
             shared, state, row, s, length, present, np.full(n, reach), CLEARANCE, entering,
             ordered=[o for o in orders if not (left[o.first] or (present[o.first] and row[o.first] >= o.at))],
         )  # fmt: skip
@@ -126,10 +126,10 @@ def played(plan: Plan, seed: int, reach: float = 300.0, rounds: int = 4000) -> i
             rears = [s[j] - length[j] - ways.begin[row[j]] for j in np.flatnonzero(present) if ways.edge[row[j]] == e]
             tails = [1 for j in np.flatnonzero(present) for f, _ in under(ways, row, s, length, int(j)) if f == e]
             clear = min(rears, default=np.inf) > length[i] + CLEARANCE if rears else not tails
-            if held.room[i] > 0.0 and clear:
+            if ends.room[i] > 0.0 and clear:
                 present[i] = moved = True
         here = along.places(ways, net, row, s, length, present, 20000.0, interlocking.order(state))
-        room = np.minimum(bodies.obstacles(here, virtual=False).room, held.room) - MARGIN
+        room = np.minimum(bodies.obstacles(here, virtual=False).room, ends.room) - MARGIN
         for i in np.flatnonzero(present & (rng.random(n) < 0.7) & (room > 0.5)).tolist():
             if entering[i]:
                 continue
@@ -150,7 +150,7 @@ def played(plan: Plan, seed: int, reach: float = 300.0, rounds: int = 4000) -> i
         i: (_names(plan)[ways.edge[row[i]]], round(float(s[i] - ways.begin[row[i]]), 1), float(length[i]))
         for i in np.flatnonzero(present)
     }
-    raise AssertionError(f"seed {seed}: {np.flatnonzero(~left).tolist()} never arrive: {where}, {state}, {held}")
+    raise AssertionError(f"seed {seed}: {np.flatnonzero(~left).tolist()} never arrive: {where}, {state}, {ends}")
 
 
 def in_order(plan: Plan, ways: Any) -> list[zones.Ordered]:

@@ -48,11 +48,11 @@ def decided(switches: int) -> tuple[int, float, float]:
     spent, state = [time.process_time() - begun], interlocking.none()
     for _ in range(2):
         begun = time.process_time()
-        state, held, _ = interlocking.request(
+        state, ends, _ = interlocking.request(
             shared, state, row, s, np.full(n, TRAIN_M), np.ones(n, bool), np.full(n, REACH_M), CLEARANCE
         )
         spent.append(time.process_time() - begun)
-    assert (held.room > 0.0).any()  # somebody may go on
+    assert (ends.room > 0.0).any()  # somebody may go on
     return n, spent[1], spent[2]
 
 

@@ -177,12 +177,12 @@ class Alarms:
     ) -> Iterator[tuple[str, Alarm]]:
         """Long waits and circles, as kind and fields of events; ``due`` are the trains that are to come now, one on each edge."""
         p, found, since = self.p, list[Wait](), dict[int, float]()
-        if around.view is None or around.held is None:
+        if around.view is None or around.ends is None:
             return
         rules, assumed = (p.driver_rules, p.relied_on_by_driver) if p.driven else (p.supervision, p.assumed)
         if rules.mode == "on":  # otherwise nothing keeps a train from going on
             found = waiting.waits(
-                around.view, around.held, here, speed, rules, assumed, p.scenario.run.step_s, p.step_theta, traffic.standing
+                around.view, around.ends, here, speed, rules, assumed, p.scenario.run.step_s, p.step_theta, traffic.standing
             )
         back = np.flatnonzero(traffic.kept_back >= 0).tolist()
         found += [Wait(i, int(traffic.kept_back[i]), int(here.edge[i]), waiting.TURN) for i in back]
@@ -192,7 +192,7 @@ class Alarms:
             known = {w.train for w in found}
             stand = np.flatnonzero(waiting.standing(here, speed, traffic.standing)).tolist()
             found += [Wait(i, -1, int(here.edge[i]), None) for i in stand if i not in known]
-        entries = waiting.entries(p.roster, traffic.came, due, t, around.held, around.kept_out)
+        entries = waiting.entries(p.roster, traffic.came, due, t, around.ends, around.kept_out)
         since = {w.train: float(p.roster.depart[w.train]) for w in entries}
         yield from self.waiting.new(t, found + entries, since, s.waiting)
 

@@ -17,7 +17,7 @@ from trainctl.signals import Bools, Floats
 
 if TYPE_CHECKING:
     from trainctl.railway.authority import View
-    from trainctl.railway.interlocking import Held
+    from trainctl.railway.interlocking import EndOfAuthority
     from trainctl.scenario.roster import Roster
     from trainctl.signals import Seen
 
@@ -47,7 +47,7 @@ def standing(here: Seen, speed: Floats, own_stop: Bools) -> Bools:
 
 
 def waits(
-    view: View, held: Held, here: Seen, speed: Floats, rules: supervisor.Params, assumed: supervisor.Assumed, step: float,
+    view: View, ends: EndOfAuthority, here: Seen, speed: Floats, rules: supervisor.Params, assumed: supervisor.Assumed, step: float,
     theta: float, own_stop: Bools,
 ) -> list[Wait]:  # fmt: skip
     """What forbids each train that stands to start.
@@ -56,8 +56,8 @@ def waits(
     ----------
     view : View
         What is ahead of every train.
-    held : Held
-        Who is held at which switch, by whom.
+    ends : EndOfAuthority
+        Where each movement authority ends, and for whom.
     here : Seen
         Where the trains are.
     speed : ndarray, shape (n,)
@@ -81,7 +81,7 @@ def waits(
         for i in np.flatnonzero(stand & (verdict.reason >= 0) & (verdict.maximum * step < STANDS_MPS)).tolist():
             if switch:
                 at = SIGNAL if verdict.reason[i] == supervisor.SIGNAL else SWITCH
-                found.append(Wait(i, int(held.by[i]), int(held.zone[i]), at))
+                found.append(Wait(i, int(ends.by[i]), int(ends.zone[i]), at))
             else:
                 j = int(others[verdict.target[i]])
                 found.append(Wait(i, j, int(here.edge[j]), TRAIN))
@@ -99,7 +99,7 @@ def kept_out(view: View, i: int) -> int:
     return int(t.other[rows[k]] if k < len(ahead) else t.train[rows[k]])
 
 
-def entries(roster: Roster, came: Bools, due: Sequence[int], t: float, held: Held, out: Mapping[int, int]) -> list[Wait]:
+def entries(roster: Roster, came: Bools, due: Sequence[int], t: float, ends: EndOfAuthority, out: Mapping[int, int]) -> list[Wait]:
     """What trains wait for that are to come and have not, of those ``due`` (the first on each edge) and the ones behind them.
 
     ``out`` says who keeps out those that no switch does.
@@ -113,8 +113,8 @@ def entries(roster: Roster, came: Bools, due: Sequence[int], t: float, held: Hel
         edge = int(roster.edge[i])
         if first.get(edge, i) != i:
             found.append(Wait(i, first[edge], edge, ENTRY))
-        elif held.room[i] <= 0.0:
-            found.append(Wait(i, int(held.by[i]), int(held.zone[i]), SWITCH))
+        elif ends.room[i] <= 0.0:
+            found.append(Wait(i, int(ends.by[i]), int(ends.zone[i]), SWITCH))
         else:
             found.append(Wait(i, out.get(i, -1), edge, ENTRY))
     return found

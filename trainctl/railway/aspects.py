@@ -18,7 +18,7 @@ from numba import njit
 
 from trainctl.kernels import keep_by_sources
 from trainctl.railway.along import Order
-from trainctl.railway.interlocking import Held
+from trainctl.railway.interlocking import EndOfAuthority
 from trainctl.railway.ways import SAME_M, Ways
 from trainctl.signals import Bools, Floats, Ints
 
@@ -99,7 +99,7 @@ def sighted(ways: Ways, at: Ints, row: Ints, s: Floats, present: Bools, horizon:
 
 def decide(
     ways: Ways, seen: Sighted, green: Bools, s: Floats, present: Bools, asks: Bools, braking: Floats, binding: Floats, before: State
-) -> tuple[State, Held, list[Told]]:
+) -> tuple[State, EndOfAuthority, list[Told]]:
     """How far every train may go.
 
     Parameters
@@ -121,7 +121,7 @@ def decide(
     -------
     State
         Now.
-    Held
+    EndOfAuthority
         ``room`` up to the first signal that a train must not pass, less ``STANDS_BEFORE_M``; ``zone`` the edge behind it; ``by``
         the train that is first before it, -1 if it is the train itself.
     list of Told
@@ -151,7 +151,7 @@ def decide(
         passed[i] = _leads_past(ways, i, float(before.place[i]), int(before.behind[i]))
     told = [Told(i, int(before.red[i]), True, 0.0) for i in np.flatnonzero(passed).tolist()]
     told += [Told(i, int(red[i]), False, float(place[i] - s[i])) for i in np.flatnonzero(lost & ~passed).tolist()]
-    return State(first, steps, red, place, np.where(red >= 0, zone, -1), cleared, claims), Held(room, zone, by), told
+    return State(first, steps, red, place, np.where(red >= 0, zone, -1), cleared, claims), EndOfAuthority(room, zone, by), told
 
 
 def _leads_past(ways: Ways, i: int, place: float, edge: int) -> bool:

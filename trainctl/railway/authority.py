@@ -37,7 +37,7 @@ class View(NamedTuple):
 
 def look(
     ways: Ways, net: along.Net, limit: Floats, falls: Bools, factor: Floats, row: Ints, s: Floats, speed: Floats, length: Floats,
-    present: Bools, horizon: float, held: Floats, order: along.Order | None, internal: Bools, at: int = SWITCH,
+    present: Bools, horizon: float, end: Floats, order: along.Order | None, internal: Bools, at: int = SWITCH,
     back: Bools | None = None,
 ) -> View:  # fmt: skip
     """Look ahead along the ways of all trains.
@@ -58,7 +58,7 @@ def look(
         Row in the ways, front [m], speed [m/s], length [m], and whether it is on the net.
     horizon : float
         How far to look [m].
-    held : ndarray, shape (n,)
+    end : ndarray, shape (n,)
         How far every front may go because what comes then is another train's turn [m]; inf: as far as it likes.
     order : Order, optional
         Turns that are decided, see ``interlocking.order``.
@@ -76,8 +76,8 @@ def look(
     """
     placed = along.places(ways, net, row, s, length, present, horizon, order)
     there = _short(bodies(placed, virtual=False), ways, net, internal, row, s)
-    clear = _targets(there, held, speed, present, at)
-    targets = _targets(bodies(placed), held, speed, present, at) if len(placed.join_train) else clear
+    clear = _targets(there, end, speed, present, at)
+    targets = _targets(bodies(placed), end, speed, present, at) if len(placed.join_train) else clear
     room, body = np.full(len(row), np.inf), np.full(len(row), -1, np.int64)
     far_first = np.argsort(-there.room)
     real = far_first[(there.sense[far_first] != 0) & there.sure[far_first]]
@@ -97,17 +97,17 @@ def _short(there: Bodies, ways: Ways, net: along.Net, internal: Bools, row: Ints
     return there._replace(room=room)
 
 
-def _targets(body: Bodies, held: Floats, speed: Floats, present: Bools, at: int) -> Targets:
+def _targets(body: Bodies, end: Floats, speed: Floats, present: Bools, at: int) -> Targets:
     """Bodies in the way, and the places where trains are held.
 
     Who comes the other way beyond the place where a train is held turns off before, or is held itself.
     """
-    blocked = np.flatnonzero(present[body.train] & ((body.sense >= 0) | (body.room < held[body.train])))
+    blocked = np.flatnonzero(present[body.train] & ((body.sense >= 0) | (body.room < end[body.train])))
     kind = np.where(body.sense > 0, TRAIN, np.where(body.sense < 0, OPPOSING, SWITCH))[blocked]
-    waits = np.flatnonzero(np.isfinite(held) & present)
+    waits = np.flatnonzero(np.isfinite(end) & present)
     return Targets(
         train=np.concatenate([body.train[blocked], waits]),
-        room=np.concatenate([body.room[blocked], held[waits]]),
+        room=np.concatenate([body.room[blocked], end[waits]]),
         speed=np.concatenate([np.where(kind == SWITCH, 0.0, speed[body.other[blocked]]), np.zeros(len(waits))]),
         moving=np.concatenate([kind != SWITCH, np.zeros(len(waits), bool)]),
         kind=np.concatenate([kind, np.full(len(waits), at)]).astype(np.int64),

@@ -35,8 +35,8 @@ class State(TypedDict):
     until: dict[str, float]  # train number: position up to which it has requested [m]
 
 
-class Held(NamedTuple):
-    """How far each train may go."""
+class EndOfAuthority(NamedTuple):
+    """Where the movement authority of each train ends."""
 
     room: Floats  # (n,) m from the front to a stretch it must not enter yet; inf: free
     zone: Ints  # (n,) edge over which it would enter, -1
@@ -68,7 +68,7 @@ def request(
     zones: Zones, state: State, row: Ints, s: Floats, length: Floats, present: Bools, reach: Floats,
     clearance: float = 0.0, entering: Bools | None = None, stop: Floats | None = None, stands: Bools | None = None,
     ordered: Sequence[Ordered] = (), keeps: Bools | None = None, back: Mapping[int, Sequence[int]] = deadlock.NOBODY,
-) -> tuple[State, Held, list[Decision]]:  # fmt: skip
+) -> tuple[State, EndOfAuthority, list[Decision]]:  # fmt: skip
     """Requests of all trains at one instant.
 
     Parameters
@@ -100,7 +100,7 @@ def request(
     -------
     State
         Requests now.
-    Held
+    EndOfAuthority
         How far each train may go.
     list of Decision
         Requests that were made or granted just now, in order.
@@ -128,7 +128,7 @@ def request(
     nearing = present & (after >= 0) & (begin[after] - s < reach)
     room, zone, by = np.full(len(row), np.inf), np.full(len(row), -1, np.int64), np.full(len(row), -1, np.int64)
     if not (len(at[0]) or len(ordered) or outside.any() or nearing.any() or state["joins"] or state["stretches"]):
-        return State(joins={}, stretches=[], until={}), Held(room, zone, by), []  # nobody is near anything to request
+        return State(joins={}, stretches=[], until={}), EndOfAuthority(room, zone, by), []  # nobody is near anything to request
     joins: dict[tuple[int, int], int] = {}
     stretches: dict[tuple[int, int], int] = {}
     for i, k, is_join in zip(*(a.tolist() for a in at), strict=True):
@@ -167,13 +167,13 @@ def request(
                 queues = {e: [j for j in queue if (j, e) in joins] for e, queue in queues.items()}
     order = [key for key in order if key in granted]
     new = granted.keys() - {(i, e) for i, e, _ in state["stretches"]}
-    held, waiting, stuck = Index(zones, trains), Index(zones, trains), Index(zones, trains)
+    had, waiting, stuck = Index(zones, trains), Index(zones, trains), Index(zones, trains)
     for key in order:
         if granted[key] or (s[key[0]] > begin[stretches[key]] and not outside[key[0]]):
             if not granted[key]:
                 said.append(Decision(*key, True, -1, False))
             granted[key] = True
-            held.add(key[0], [stretches[key]])
+            had.add(key[0], [stretches[key]])
     leading: dict[int, set[int]] = {}
     for key in order:
         if granted[key]:
@@ -196,9 +196,9 @@ def request(
             blocker = shut[i][1]
         elif blocker < 0:
             rest, in_front = _needed_too(trains, i, k, clearance, leading, granted, queues)
-            later = held.blocker(i, rest)
+            later = had.blocker(i, rest)
             later = in_front if later < 0 else later
-            blocker = max(held.blocker(i, [k]), waiting.blocker(i, [k]), key=lambda j: j >= 0)
+            blocker = max(had.blocker(i, [k]), waiting.blocker(i, [k]), key=lambda j: j >= 0)
             if blocker < 0:
                 blocker = later if later >= 0 else waiting.blocker(i, rest)
             if blocker >= 0 and later < 0:
@@ -225,7 +225,7 @@ def request(
                 room[i], zone[i], by[i] = max(begin[k] - s[i], 0.0), e, blocker
             continue
         there[i], here = True, None
-        held.add(i, [k, *rest])
+        had.add(i, [k, *rest])
         for r in [k, *rest]:
             one = (i, int(edge[r]))
             if one not in granted:
@@ -269,7 +269,7 @@ def request(
         stretches=[(i, e, granted[i, e]) for i, e in order],
         until={str(i): float(until[i]) for i in sorted({i for i, _ in (*joins, *stretches)})},
     )
-    return now, Held(room, zone, by), said
+    return now, EndOfAuthority(room, zone, by), said
 
 
 def _until(

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trainctl.railway import aspects, supervisor
-from trainctl.railway.interlocking import Held
+from trainctl.railway.interlocking import EndOfAuthority
 from trainctl.railway.ways import Ways
 from trainctl.scenario.model import Model
 from trainctl.signals import Floats, Ints, Seen
@@ -55,7 +55,7 @@ class Signals:
 
     def step(
         self, t: float, ways: Ways, seen: Seen, speed: Floats, traffic: Traffic, box: SignalBox | None, s: State
-    ) -> tuple[State, Held | None]:  # fmt: skip
+    ) -> tuple[State, EndOfAuthority | None]:  # fmt: skip
         """How far every train may go before a signal; None where they are not obeyed.
 
         Parameters
@@ -86,7 +86,7 @@ class Signals:
         known = seen.present[sighted.train]
         signals, which = np.unique(sighted.signal[known], return_inverse=True)
         green[known] = box.green(signals)[which]
-        now, held, told = aspects.decide(
+        now, ends, told = aspects.decide(
             ways, sighted, green, seen.position, seen.present, ~traffic.standing, braking, binding, s.aspects
         )  # fmt: skip
         ids, roster = self.p.scenario.ids, self.p.roster
@@ -98,16 +98,16 @@ class Signals:
                 self.journal.event(
                     t, "green_withdrawn", train=ids[one.train], signal=name, room_m=one.room, braking_m=float(braking[one.train])
                 )  # fmt: skip
-        stands = seen.present & (v < STANDS_MPS) & (held.room < AT_M) & (now.red >= 0) & ~traffic.standing
-        for i in np.flatnonzero(stands & (held.by < 0)).tolist():
-            held.by[i] = box.blocker(int(now.red[i]))
+        stands = seen.present & (v < STANDS_MPS) & (ends.room < AT_M) & (now.red >= 0) & ~traffic.standing
+        for i in np.flatnonzero(stands & (ends.by < 0)).tolist():
+            ends.by[i] = box.blocker(int(now.red[i]))
         stand = np.where(stands, now.red, -1)
         for i in np.flatnonzero((stand >= 0) & (stand != s.at)).tolist():
-            other = ids[held.by[i]] if held.by[i] >= 0 else None
+            other = ids[ends.by[i]] if ends.by[i] >= 0 else None
             self.journal.event(t, "signal", train=ids[i], signal=roster.signals[stand[i]].name, other=other)
-        return State(now, stand), held
+        return State(now, stand), ends
 
-    def before(self, ways: Ways, seen: Seen) -> Held:
+    def before(self, ways: Ways, seen: Seen) -> EndOfAuthority:
         """How far trains may go before anything is known of any signal: up to the first one."""
         n = len(seen.row)
         sighted = aspects.sighted(ways, self._table(ways), seen.row, seen.position, np.ones(n, bool), self.entering)

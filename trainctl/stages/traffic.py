@@ -11,7 +11,7 @@ import numpy as np
 from trainctl.monitors import waiting
 from trainctl.railway import along, aspects, authority, interlocking, signs, supervisor, zones
 from trainctl.railway.authority import DRIVER_MARGIN_M, View
-from trainctl.railway.interlocking import Held
+from trainctl.railway.interlocking import EndOfAuthority
 from trainctl.railway.ways import Ways, moved, unchanged
 from trainctl.record.columns import Call
 from trainctl.scenario import mixed
@@ -76,7 +76,7 @@ class Around(NamedTuple):
     entries: tuple[tuple[int, float], ...]  # trains that come with the coming step, with their speeds [m/s]
     stops: tuple[Ints, Floats]  # trains with a stop ahead, and the room to it [m]
     soon: Bools  # (n,) they stop soon
-    held: Held | None  # how far each may go before a place that another has; None: not needed
+    ends: EndOfAuthority | None  # how far each may go before a place that another has; None: not needed
     kept_out: dict[int, int]  # trains that are due and cannot enter: because of whom
     view: View | None  # None: not needed
     turns: tuple[Turn, ...] = ()  # trains that turn with the coming step
@@ -128,7 +128,7 @@ class Traffic:
 
     def step(
         self, t: float, ways: Ways, seen: Seen, speed: Floats, overrun: Floats, s: State, last: bool = False,
-        red: Held | None = None,
+        red: EndOfAuthority | None = None,
     ) -> tuple[State, Around]:  # fmt: skip
         """Arrivals, stops, entries; ``overrun`` (n,) is how much farther trains run than their brakes promise [m].
 
@@ -149,16 +149,16 @@ class Traffic:
         later = t + self.step_s
         parked = s.parked & ~self.roster.driven & (s.stands_until <= later + 1e-9)  # who come back
         asking, reach = [] if last else [*np.flatnonzero(parked).tolist(), *self.due(later, s)], self._reach(speed)
-        s, held, entries, kept_out = self.entering(t, ways, s.on_track(seen), speed, s, asking, reach, red, self.step_s)
+        s, ends, entries, kept_out = self.entering(t, ways, s.on_track(seen), speed, s, asking, reach, red, self.step_s)
         present = s.on_track(seen).present.copy()
         present[[i for i, _ in entries]] = True
         reach = self._reach(speed) if entries else reach
-        view = self.turns.ends(self._look(ways, seen._replace(present=present), speed, held, s, reach), seen, overrun)
+        view = self.turns.ends(self._look(ways, seen._replace(present=present), speed, ends, s, reach), seen, overrun)
         ordered = None if self.p.obeys else lambda there, rows: self._ordered(t, there, seen._replace(row=rows), s)
         asks, known = np.flatnonzero(stood & ~np.isnan(s.turns_since) & (not last)).tolist(), (s.leg, s.turns_since, s.kept_back)
         requests, now, turns = self.turns.step(t, asks, ways, s.on_track(seen), reach, s.standing, s.requests, known, ordered)
         s = s._replace(requests=requests, leg=now[0], turns_since=now[1], kept_back=now[2])
-        return s, Around(entries, stops, soon, held, kept_out, view, turns)
+        return s, Around(entries, stops, soon, ends, kept_out, view, turns)
 
     def _take_over(self, ways: Ways, s: State) -> None:
         """Work out what follows from the ways trains have now, where they changed: zones, and the places of stops and turns."""
@@ -221,8 +221,8 @@ class Traffic:
 
     def entering(
         self, t: float, ways: Ways, here: Seen, speed: Floats, s: State, due: Sequence[int], reach: Floats | None = None,
-        red: Held | None = None, after: float = 0.0,
-    ) -> tuple[State, Held, tuple[tuple[int, float], ...], dict[int, int]]:  # fmt: skip
+        red: EndOfAuthority | None = None, after: float = 0.0,
+    ) -> tuple[State, EndOfAuthority, tuple[tuple[int, float], ...], dict[int, int]]:  # fmt: skip
         """Trains of those that are ``due`` whose place is clear, with the speed they come with [m/s]; who keeps out the others.
 
         They are there ``after`` so many seconds.
@@ -232,32 +232,32 @@ class Traffic:
         asking[due] = True
         stands = (s.kept_out >= 0) & (np.abs(speed[s.kept_out]) < STANDS_MPS)  # who stands may wait for it in turn
         if red is not None:
-            s, held = s._replace(waits_for=red.by.copy()), red
+            s, ends = s._replace(waits_for=red.by.copy()), red
         else:
             before, reach = s.waits_for, self._reach(speed) if reach is None else reach
-            s, held = self._request(t, ways, here, reach, asking, asking & ~stands, s)
-            self._let_in(t, ways, here, speed, due, np.where(np.isin(before, due), 0.0, reach), held, s)
+            s, ends = self._request(t, ways, here, reach, asking, asking & ~stands, s)
+            self._let_in(t, ways, here, speed, due, np.where(np.isin(before, due), 0.0, reach), ends, s)
         s = s._replace(parked=s.parked.copy())
         present, came, entering, reach = here.present.copy(), s.came.copy(), s.entering.copy(), self._reach(speed)
         come: list[tuple[int, float]] = []
         kept_out: dict[int, int] = {}
-        asking[[i for i in due if held.room[i] <= 0.0]] = False
+        asking[[i for i in due if ends.room[i] <= 0.0]] = False
         together: View | None = None  # with all who ask at their places
         for i in due:
-            if held.room[i] <= 0.0:
+            if ends.room[i] <= 0.0:
                 continue
             if together is None:
                 guests = asking.copy()
-                together = self._look(ways, here._replace(present=present | guests), speed, held, s, reach)
+                together = self._look(ways, here._replace(present=present | guests), speed, ends, s, reach)
             present[i], asking[i], view = True, False, together
             if meets(together, i, guests):  # to each of them only those are there that have come
-                view = self._look(ways, here._replace(present=present), speed, held, s, reach)
+                view = self._look(ways, here._replace(present=present), speed, ends, s, reach)
             if s.parked[i]:
                 present[i] = self.room.returns(i, speed, view)
                 s.parked[i] = not present[i]  # and stands for one more step, the one in which it comes back
                 together = None if present[i] else together
                 continue
-            v = self._entering_speed(i, ways, here, speed, view, held, s, after)
+            v = self._entering_speed(i, ways, here, speed, view, ends, s, after)
             present[i] = v is not None
             if v is None:
                 kept_out[i] = waiting.kept_out(view, i)
@@ -268,24 +268,24 @@ class Traffic:
             come.append((i, v))
         keeping = np.full(len(speed), -1)
         keeping[list(kept_out)] = list(kept_out.values())
-        return s._replace(came=came, entering=entering, kept_out=keeping), held, tuple(come), kept_out
+        return s._replace(came=came, entering=entering, kept_out=keeping), ends, tuple(come), kept_out
 
     def _let_in(
-        self, t: float, ways: Ways, here: Seen, speed: Floats, due: Sequence[int], can: Floats, held: Held, s: State
+        self, t: float, ways: Ways, here: Seen, speed: Floats, due: Sequence[int], can: Floats, ends: EndOfAuthority, s: State
     ) -> None:
         """Stop those that ``can`` (n,) [m] before the place of a train that running ones have kept out for long."""
         for i in due:
             edge, place = int(self.roster.edge[i]), float(self.roster.lane_position[i] - self.length[i]) - self.rules.margin_m
-            by = int(held.by[i] if held.room[i] <= 0.0 else s.kept_out[i])
+            by = int(ends.by[i] if ends.room[i] <= 0.0 else s.kept_out[i])
             passes = by < 0 or (speed[by] >= STANDS_MPS and here.edge[by] == edge)
             if t - self.roster.depart[i] < PATIENCE_S or s.parked[i] or not passes:
                 continue
             for j, room in zip(*authority.stop_before(ways, here.row, here.position, edge, place, can), strict=True):
-                if here.present[j] and room < held.room[j]:
-                    held.room[j], held.zone[j], held.by[j], s.waits_for[j] = room, edge, i, i
+                if here.present[j] and room < ends.room[j]:
+                    ends.room[j], ends.zone[j], ends.by[j], s.waits_for[j] = room, edge, i, i
 
     def _entering_speed(
-        self, i: int, ways: Ways, here: Seen, speed: Floats, view: View, held: Held, s: State, after: float
+        self, i: int, ways: Ways, here: Seen, speed: Floats, view: View, ends: EndOfAuthority, s: State, after: float
     ) -> float | None:
         """Speed with which a train can enter safely; None if it has to wait. ``view`` is that with the train at its place."""
         rules, v, roster = self.rules, self.roster.speed[i], self.roster
@@ -296,7 +296,7 @@ class Traffic:
         if roster.like[i] and np.isnan(v) and len(there):
             depth = here.position[there] - ways.begin[here.row[there]]
             wanted = min(wanted, float(speed[there].mean() if roster.like[i] == "avg" else speed[there[np.argmin(depth)]]))
-        rooms = [float(held.room[i])]  # up to where it must be able to stop
+        rooms = [float(ends.room[i])]  # up to where it must be able to stop
         if (stop := self.stop_of(i, s)) is not None:
             place = stop.place - float(self.p.rails.start_m[roster.edge[i]]) - float(roster.lane_position[i])
             rooms.append(place + self._further(stop, i))
@@ -457,10 +457,10 @@ class Traffic:
 
     def _request(
         self, t: float, ways: Ways, seen: Seen, reach: Floats, entering: Bools, keeps: Bools, s: State
-    ) -> tuple[State, Held]:
+    ) -> tuple[State, EndOfAuthority]:
         """Let every train request what lies within its reach; ``entering`` (n,) are those that ask to enter the net."""
         stops = calls.own_stops(self.calls, s.came & ~s.left, s.next_stop, s.leg)
-        requests, held, said = interlocking.request(
+        requests, ends, said = interlocking.request(
             self.zones, s.requests, seen.row, seen.position, self.length, seen.present, reach,
             self.p.supervision.margin_m + DRIVER_MARGIN_M, entering, stops, s.standing,
             self._ordered(t, ways, seen, s), keeps, self.turns.back(s.leg),
@@ -474,21 +474,21 @@ class Traffic:
                 )  # fmt: skip
             elif one.granted and not one.join and s.waits_for[one.train] >= 0:
                 self.journal.event(t, "switch_granted", train=ids[one.train], edge=edges[one.zone])
-        everyone, inside = np.arange(len(held.room)), self.p.rails.internal
-        room = zones.short_of_junctions(ways, self.net, inside, everyone, seen.row, seen.position, held.room)
-        return s._replace(requests=requests, waits_for=held.by.copy()), held._replace(room=room)
+        everyone, inside = np.arange(len(ends.room)), self.p.rails.internal
+        room = zones.short_of_junctions(ways, self.net, inside, everyone, seen.row, seen.position, ends.room)
+        return s._replace(requests=requests, waits_for=ends.by.copy()), ends._replace(room=room)
 
-    def _look(self, ways: Ways, seen: Seen, speed: Floats, held: Held, s: State, reach: Floats) -> View:
+    def _look(self, ways: Ways, seen: Seen, speed: Floats, ends: EndOfAuthority, s: State, reach: Floats) -> View:
         """What is ahead of every train."""
         sees = 2.0 if self.falls.any() else 1.0  # half the braking, twice the way
         horizon = max(sees * float(np.max(reach, where=seen.present, initial=0.0)) + 1000.0, self.join_range_m)
         if self.p.obeys:
-            order = aspects.order(ways, self.net.joins, seen.row, seen.position, seen.present, horizon, held.room)
+            order = aspects.order(ways, self.net.joins, seen.row, seen.position, seen.present, horizon, ends.room)
         else:
             order = interlocking.order(s.requests)
         # Trains that SUMO drives may stop as they like: whoever follows one keeps his whole braking distance.
         return authority.look(
             ways, self.net, self.limit, self.falls, self.roster.speed_factor, seen.row, seen.position,
-            np.where(self.roster.driven, 0.0, speed), self.length, seen.present, horizon, held.room, order,
+            np.where(self.roster.driven, 0.0, speed), self.length, seen.present, horizon, ends.room, order,
             self.p.rails.internal, supervisor.SIGNAL if self.p.obeys else supervisor.SWITCH, s.parked,
         )  # fmt: skip

@@ -197,11 +197,11 @@ class Turns:
         # It is on the track that others wait for, so it comes before whoever waits.
         begins = np.unique(along_it.begins[row[i] : there.first[i + 1]])
         first = [(i, int(there.edge[k]), False) for k in begins.tolist() if k >= 0]
-        granted, held, _ = interlocking.request(
+        granted, ends, _ = interlocking.request(
             along_it, {**requests, "stretches": [*first, *requests["stretches"]]}, row, position, self.length, present, reach,
             self.p.supervision.margin_m + DRIVER_MARGIN_M, asks, None, standing & ~asks, ordered(there, row), asks, self.back(leg),
         )  # fmt: skip
-        return (requests, int(held.by[i])) if held.room[i] <= 0.0 else (granted, None)
+        return (requests, int(ends.by[i])) if ends.room[i] <= 0.0 else (granted, None)
 
 
 def stopping(p: Model) -> Callable[[Ints, Floats], Floats]:

@@ -35,8 +35,8 @@ class Line:
             seen = aspects.sighted(self.ways, self.at, row, place, np.ones(3, bool), np.full(3, FAR))
             shown = np.isin(seen.signal, list(green))
             asks, way = ~np.isin(np.arange(3), stands), np.full(3, braking)
-            self.state, held, told = aspects.decide(self.ways, seen, shown, place, there, asks, way, 1.5 * way, self.state)
-        return held, told
+            self.state, ends, told = aspects.decide(self.ways, seen, shown, place, there, asks, way, 1.5 * way, self.state)
+        return ends, told
 
 
 @pytest.fixture
@@ -52,20 +52,20 @@ def test_signals_stand_at_the_ends_of_edges_for_those_who_go_on(line):
 
 
 def test_green_counts_for_the_first_alone_once_it_has_been_that(line):
-    held, _ = line.go([800.0, 500.0, 300.0], {0, 2}, aspects.SETTLES)
-    assert held.room.tolist() == [199.5, 499.5, 699.5] and held.by.tolist() == [-1, 0, -1]  # not yet settled
-    held, told = line.go([800.0, 500.0, 300.0], {0, 2})
-    assert np.isinf(held.room[0]) and held.room[1:].tolist() == [499.5, 699.5] and not told
-    assert held.zone.tolist() == [-1, 2, 2] and held.by.tolist() == [-1, 0, -1]
-    held, _ = line.go([1100.0, 500.0, 300.0], {0, 2})  # it has passed; what its follower sees is still its green
-    assert held.room[1] == 499.5 and held.by[1] == -1
-    held, _ = line.go([1100.0, 500.0, 300.0], {0, 2}, aspects.SETTLES)
-    assert held.room[1] == 999.5 and held.by[1] == 0  # up to the next signal, where the other one is the first
+    ends, _ = line.go([800.0, 500.0, 300.0], {0, 2}, aspects.SETTLES)
+    assert ends.room.tolist() == [199.5, 499.5, 699.5] and ends.by.tolist() == [-1, 0, -1]  # not yet settled
+    ends, told = line.go([800.0, 500.0, 300.0], {0, 2})
+    assert np.isinf(ends.room[0]) and ends.room[1:].tolist() == [499.5, 699.5] and not told
+    assert ends.zone.tolist() == [-1, 2, 2] and ends.by.tolist() == [-1, 0, -1]
+    ends, _ = line.go([1100.0, 500.0, 300.0], {0, 2})  # it has passed; what its follower sees is still its green
+    assert ends.room[1] == 499.5 and ends.by[1] == -1
+    ends, _ = line.go([1100.0, 500.0, 300.0], {0, 2}, aspects.SETTLES)
+    assert ends.room[1] == 999.5 and ends.by[1] == 0  # up to the next signal, where the other one is the first
 
 
 def test_the_first_red_ends_the_authority_whatever_is_behind_it(line):
-    held, _ = line.go([800.0, 500.0, 300.0], {2}, 5)
-    assert held.room.tolist() == [199.5, 499.5, 699.5] and line.state.red.tolist() == [0, 0, 1]
+    ends, _ = line.go([800.0, 500.0, 300.0], {2}, 5)
+    assert ends.room.tolist() == [199.5, 499.5, 699.5] and line.state.red.tolist() == [0, 0, 1]
 
 
 def test_a_green_that_is_taken_back_is_told_where_it_comes_too_late(line):
@@ -94,12 +94,12 @@ def test_a_green_is_claimed_that_could_not_be_given_up_by_the_next_step(line):
 
 
 def test_who_stands_at_a_stop_asks_for_nothing_and_its_green_means_nothing(line):
-    held, _ = line.go([800.0, 500.0, 300.0], {0, 2}, 10, stands=(0,))
-    assert held.room[0] == 199.5 and line.state.claims == []
-    held, _ = line.go([800.0, 500.0, 300.0], {0, 2}, aspects.SETTLES - 1)
-    assert held.room[0] == 199.5
-    held, _ = line.go([800.0, 500.0, 300.0], {0, 2})
-    assert np.isinf(held.room[0])
+    ends, _ = line.go([800.0, 500.0, 300.0], {0, 2}, 10, stands=(0,))
+    assert ends.room[0] == 199.5 and line.state.claims == []
+    ends, _ = line.go([800.0, 500.0, 300.0], {0, 2}, aspects.SETTLES - 1)
+    assert ends.room[0] == 199.5
+    ends, _ = line.go([800.0, 500.0, 300.0], {0, 2})
+    assert np.isinf(ends.room[0])
 
 
 def test_a_red_that_is_passed_is_told(line):
@@ -125,10 +125,10 @@ def test_a_train_that_turned_or_was_led_another_way_has_passed_nothing(line):
 
 
 def test_who_is_not_there_may_go_to_its_first_signal_and_is_in_nobodys_way(line):
-    held, told = line.go([800.0, 500.0, 300.0], {0, 1, 2}, 5, 900.0, (1, 2))
-    assert held.room[0] == 199.5 and np.isinf(held.room[1]) and not told  # train 1 is the first that is there
-    held, told = line.go([800.0, 500.0, 300.0], {0, 1, 2}, 1, 900.0)
-    assert held.room[0] == 199.5 and [(one.train, one.passed) for one in told] == [(1, False)]  # it has come just before train 1
+    ends, told = line.go([800.0, 500.0, 300.0], {0, 1, 2}, 5, 900.0, (1, 2))
+    assert ends.room[0] == 199.5 and np.isinf(ends.room[1]) and not told  # train 1 is the first that is there
+    ends, told = line.go([800.0, 500.0, 300.0], {0, 1, 2}, 1, 900.0)
+    assert ends.room[0] == 199.5 and [(one.train, one.passed) for one in told] == [(1, False)]  # it has come just before train 1
 
 
 def test_turns_at_joins_are_those_of_the_signals(line):

@@ -54,10 +54,10 @@ class Yard:
         shared = zones.of(ways, along.net(self.net))
         before = json.dumps(self.state)
         arrays = (row, s, self.length, self.present)
-        self.state, held, said = interlocking.request(shared, self.state, *arrays, self.reach, self.clearance, **more)
+        self.state, ends, said = interlocking.request(shared, self.state, *arrays, self.reach, self.clearance, **more)
         assert json.loads(json.dumps(self.state)) == json.loads(json.dumps(self.state)) and before is not None
         self.state = json.loads(json.dumps(self.state))  # as a checkpoint keeps it
-        return held, said
+        return ends, said
 
     def put(self, i, edge, x):
         self.at[i] = (self.net.number[edge], x)
@@ -72,17 +72,17 @@ SINGLE = railway(
 
 def test_single_track_goes_to_who_comes_first_and_to_the_other_when_its_rear_has_left():
     yard = Yard(SINGLE, [("a s b", "a", 950, 200), ("c S d", "c", 910, 200), ("c S d", "c", 500, 100)])
-    held, said = yard.now()
-    assert held.room.tolist() == [np.inf, 90.0, np.inf]
-    assert (held.by[1], held.zone[1]) == (0, SINGLE.number["S"])
+    ends, said = yard.now()
+    assert ends.room.tolist() == [np.inf, 90.0, np.inf]
+    assert (ends.by[1], ends.zone[1]) == (0, SINGLE.number["S"])
     assert [(d.train, d.granted, d.by) for d in said] == [(0, True, -1), (1, False, 0)]
     yard.put(0, "b", 199.0)
-    held, said = yard.now()
-    assert held.room[1] == 90.0
+    ends, said = yard.now()
+    assert ends.room[1] == 90.0
     assert said == []
     yard.put(0, "b", 200.0)
-    held, said = yard.now()
-    assert held.room[1] == np.inf
+    ends, said = yard.now()
+    assert ends.room[1] == np.inf
     assert [(d.train, d.granted) for d in said] == [(1, True)]
 
 
@@ -94,8 +94,8 @@ def test_trains_of_one_direction_follow_but_not_past_one_who_waits_at_the_other_
     yard.put(0, "b", 500)
     yard.put(1, "s", 900)
     yard.put(3, "a", 950)
-    held, _ = yard.now()
-    assert held.by.tolist() == [-1, -1, 1, 2]
+    ends, _ = yard.now()
+    assert ends.by.tolist() == [-1, -1, 1, 2]
 
 
 def test_a_claim_is_kept_when_the_reach_shrinks_and_lost_when_the_way_leads_elsewhere():
@@ -109,8 +109,8 @@ def test_a_claim_is_kept_when_the_reach_shrinks_and_lost_when_the_way_leads_else
     yard.reach[0] = 10.0
     assert yard.now()[0].by.tolist() == [-1, 0, -1, -1]
     yard.paths[0] = [net.number[e] for e in ("a", "e")]
-    held, said = yard.now()
-    assert held.by.tolist() == [-1, -1, -1, -1]
+    ends, said = yard.now()
+    assert ends.by.tolist() == [-1, -1, -1, -1]
     assert [(d.train, d.granted) for d in said] == [(1, True)]
 
 
@@ -120,8 +120,8 @@ CROSS = railway({"a": 500, "x": 20, "b": 500, "c": 500, "y": 20, "d": 500}, [("a
 
 def test_a_crossing_is_kept_clear_from_the_first_claim_to_the_rear():
     yard = Yard(CROSS, [("a x b", "a", 450, 100), ("c y d", "c", 460, 50)])
-    held, _ = yard.now()
-    assert held.room.tolist() == [50.0, np.inf]  # both are new: the nearer one goes
+    ends, _ = yard.now()
+    assert ends.room.tolist() == [50.0, np.inf]  # both are new: the nearer one goes
     yard.put(1, "d", 49.0)
     assert yard.now()[0].room[0] == 50.0
     yard.put(1, "d", 50.0)
@@ -135,8 +135,8 @@ def test_turns_at_a_join_stay_and_those_of_one_track_keep_the_order_they_stand_i
     trains = [("a m", "a", 800, 100), ("b m", "b", 700, 100), ("a m", "a", 890, 50), ("b m", "b", 600, 50)]
     yard = Yard(MERGE, trains)
     yard.reach = np.array([250.0, 310.0, 50.0, 10.0])
-    held, said = yard.now()
-    assert np.isinf(held.room).all()  # turns hold nobody
+    ends, said = yard.now()
+    assert np.isinf(ends.room).all()  # turns hold nobody
     assert [(d.train, d.granted, d.by) for d in said] == [(0, True, -1), (1, False, 0)]
     yard.put(2, "a", 960)  # stands before 0 but requests later
     yard.put(1, "b", 950)  # overtakes 0 by distance, but not its turn
@@ -161,11 +161,11 @@ def test_a_train_that_wants_to_enter_the_net_in_a_stretch_waits_for_it():
     yard = Yard(SINGLE, [("c S d", "S", 500, 100), ("s b", "s", 100, 100)])
     yard.present[1] = False
     entering = np.array([False, True])
-    held, said = yard.now(entering=entering)
-    assert (held.room[1], held.by[1]) == (0.0, 0)
+    ends, said = yard.now(entering=entering)
+    assert (ends.room[1], ends.by[1]) == (0.0, 0)
     yard.put(0, "d", 100)
-    held, said = yard.now(entering=entering)
-    assert held.room[1] == np.inf
+    ends, said = yard.now(entering=entering)
+    assert ends.room[1] == np.inf
     assert said[-1].train == 1
 
 
@@ -173,12 +173,12 @@ def test_a_train_that_waits_to_enter_keeps_its_turn_at_the_join_and_who_comes_la
     yard = Yard(MERGE, [("a m", "a", 200, 100), ("b m", "b", 800, 100), ("a m", "a", 700, 100)], clearance=10.0)
     yard.present[1], entering = False, np.array([False, True, False])
     yard.reach = np.array([400.0, 300.0, 400.0])
-    held, _ = yard.now(entering=entering)
-    assert held.room.tolist() == [np.inf, np.inf, np.inf]  # the third could perhaps not wait any more, the first is far
+    ends, _ = yard.now(entering=entering)
+    assert ends.room.tolist() == [np.inf, np.inf, np.inf]  # the third could perhaps not wait any more, the first is far
     yard.put(0, "a", 650.0)
     yard.put(2, "m", 300.0)
-    held, said = yard.now(entering=entering)
-    assert (held.room[0], held.by[0], held.zone[0]) == (350.0, 1, MERGE.number["m"])
+    ends, said = yard.now(entering=entering)
+    assert (ends.room[0], ends.by[0], ends.zone[0]) == (350.0, 1, MERGE.number["m"])
     assert [(d.train, d.by, d.join) for d in said] == [(0, 1, True)]
     # Unless one that stands keeps it out, which perhaps waits for it.
     assert np.isinf(yard.now(entering=entering, keeps=np.zeros(3, bool))[0].room[0])
@@ -194,16 +194,16 @@ def test_who_is_to_enter_in_the_middle_of_a_line_gets_its_gap():
     assert np.isinf(yard.now(entering=entering)[0].room).all()
     yard.put(0, "b", 300)
     yard.put(2, "a", 500)
-    held, _ = yard.now(entering=entering)
-    assert (held.room[2], held.by[2]) == (500.0, 1) and np.isinf(held.room[:2]).all()
+    ends, _ = yard.now(entering=entering)
+    assert (ends.room[2], ends.by[2]) == (500.0, 1) and np.isinf(ends.room[:2]).all()
 
 
 def test_nobody_enters_where_another_one_is_and_it_bars_nobody():
     yard = Yard(SINGLE, [("a s b", "a", 950, 200), ("a s b", "a", 900, 100), ("c S d", "c", 950, 100)], clearance=10.0)
     yard.present[1], entering = False, np.array([False, True, False])
     yard.reach[0] = 10.0
-    held, _ = yard.now(entering=entering)
-    assert (held.room[1], held.by[1]) == (0.0, 0) and np.isinf(held.room[2])
+    ends, _ = yard.now(entering=entering)
+    assert (ends.room[1], ends.by[1]) == (0.0, 0) and np.isinf(ends.room[2])
 
 
 def test_a_request_ends_at_the_own_stop_and_what_lies_ahead_of_a_stand_is_given_back():
@@ -212,13 +212,13 @@ def test_a_request_ends_at_the_own_stop_and_what_lies_ahead_of_a_stand_is_given_
         yard = Yard(SINGLE, trains, clearance=50.0)
         yard.reach[:] = 400.0
         stop = np.array([place, np.inf])
-        held, _ = yard.now(stop=stop)
-        assert held.room.tolist() == ([300.0, np.inf] if capped else [np.inf, 300.0])  # what it did not request is not its own
+        ends, _ = yard.now(stop=stop)
+        assert ends.room.tolist() == ([300.0, np.inf] if capped else [np.inf, 300.0])  # what it did not request is not its own
         yard.put(0, "a", place)
-        held, _ = yard.now(stop=stop, stands=np.array([True, False]))
-        assert held.room.tolist() == [1000.0 - place, np.inf]
-        held, _ = yard.now()
-        assert held.by.tolist() == [1, -1]  # now it comes in its turn
+        ends, _ = yard.now(stop=stop, stands=np.array([True, False]))
+        assert ends.room.tolist() == [1000.0 - place, np.inf]
+        ends, _ = yard.now()
+        assert ends.by.tolist() == [1, -1]  # now it comes in its turn
         yard.put(1, "d", 200)
         assert np.isinf(yard.now()[0].room).all()
 
@@ -230,11 +230,11 @@ def test_trains_that_stand_at_once_give_back_one_after_another():
     )  # fmt: skip
     yard = Yard(net, [("a m s b", "a", 880, 100), ("e m s b", "e", 870, 100), ("c S M d", "c", 800, 100)], clearance=10.0)
     yard.reach[:2] = 300.0
-    held, _ = yard.now()
-    assert np.isinf(held.room[:2]).all() and yard.state["joins"] == {str(net.number["m"]): [0, 1]}
+    ends, _ = yard.now()
+    assert np.isinf(ends.room[:2]).all() and yard.state["joins"] == {str(net.number["m"]): [0, 1]}
     yard.reach[2] = 300.0
-    held, _ = yard.now(stop=np.array([880.0, 870.0, np.inf]), stands=np.array([True, True, False]))
-    assert np.isinf(held.room[2]) and yard.state["joins"] == {}
+    ends, _ = yard.now(stop=np.array([880.0, 870.0, np.inf]), stands=np.array([True, True, False]))
+    assert np.isinf(ends.room[2]) and yard.state["joins"] == {}
 
 
 def test_a_join_beyond_the_own_stop_is_not_requested():
@@ -252,11 +252,11 @@ def test_a_stand_keeps_what_nobody_could_get_out_without():
         twins=[("s", "S"), ("t", "T")],
     )  # fmt: skip
     yard = Yard(net, [("a s p t b", "p", 290, 500), ("c T q S d", "c", 950, 100)])
-    held, _ = yard.now(stop=np.array([2190.0, np.inf]), stands=np.array([True, False]))
-    assert np.isinf(held.room[0]) or held.by[0] != 1
+    ends, _ = yard.now(stop=np.array([2190.0, np.inf]), stands=np.array([True, False]))
+    assert np.isinf(ends.room[0]) or ends.by[0] != 1
     yard.length[0] = 200.0
-    held, _ = yard.now(stop=np.array([2190.0, np.inf]), stands=np.array([True, False]))
-    assert np.isinf(held.room[1])  # a short one gives way
+    ends, _ = yard.now(stop=np.array([2190.0, np.inf]), stands=np.array([True, False]))
+    assert np.isinf(ends.room[1])  # a short one gives way
 
 
 LINE = railway(
@@ -313,9 +313,9 @@ def drive(net_of, routes, seed, n, limit=9000):
             if min(rest, default=np.inf) > length[i] + 20.0:
                 present[i], s[i] = True, length[i]
         reach = v**2 / (2 * BRAKING) + 3 * v + 2 * MARGIN
-        state, held, _ = interlocking.request(shared, state, row, s, length, present, reach, 2 * MARGIN)
+        state, ends, _ = interlocking.request(shared, state, row, s, length, present, reach, 2 * MARGIN)
         here = along.places(ways, net, row, s, length, present, 3000.0, interlocking.order(state))
-        room = np.minimum(bodies.obstacles(here, virtual=False).room, held.room) - MARGIN
+        room = np.minimum(bodies.obstacles(here, virtual=False).room, ends.room) - MARGIN
         wanted = np.minimum(v + acceleration, top)
         stops = -BRAKING + np.sqrt(BRAKING**2 + 2 * BRAKING * np.maximum(room, 0.0))  # v^2 / 2b + v <= room
         v = np.where(present, np.minimum(wanted, stops), 0.0)
@@ -340,7 +340,7 @@ def drive(net_of, routes, seed, n, limit=9000):
         if left.all():
             assert all(passed[e].index(a) < passed[e].index(b) for e, a, b in turns)
             return step
-    raise AssertionError(f"seed {seed}: {np.flatnonzero(~left).tolist()} never arrive: {s}, {ways.edge[row]}, {state}, {held}")
+    raise AssertionError(f"seed {seed}: {np.flatnonzero(~left).tolist()} never arrive: {s}, {ways.edge[row]}, {state}, {ends}")
 
 
 @pytest.mark.parametrize(("seed", "n"), [(0, 10), (1, 10), (2, 14), (1001, 18)])
@@ -369,6 +369,6 @@ def test_alone_nobody_is_held(kind):
     for edge in path:
         for part in (0.0, 0.5, 1.0):
             yard.put(len(LINE_WAYS), edge, part * LINE.length_m[LINE.number[edge]])
-            held, said = yard.now()
-            assert np.isinf(held.room).all()
+            ends, said = yard.now()
+            assert np.isinf(ends.room).all()
             assert all(d.granted for d in said)

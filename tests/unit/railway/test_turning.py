@@ -93,8 +93,8 @@ def test_the_way_back_is_free_of_who_stands_deeper_in_the_terminal(mine, other, 
     shared = zones.of(ways, along.net(STUB))
     asks, present = np.array([True, False]), np.array([False, True])
     state, _, _ = interlocking.request(shared, interlocking.none(), row, s, length, present, np.full(2, 100.0))
-    _, held, _ = interlocking.request(shared, state, row, s, length, present, np.full(2, 2000.0), 10.0, asks)
-    assert bool(held.room[0] > 0.0) is granted
+    _, ends, _ = interlocking.request(shared, state, row, s, length, present, np.full(2, 2000.0), 10.0, asks)
+    assert bool(ends.room[0] > 0.0) is granted
 
 
 def test_a_train_that_turns_needs_who_may_stand_behind_it():
