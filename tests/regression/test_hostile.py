@@ -32,7 +32,7 @@ ALWAYS_OFF, ALWAYS_SUMO = range(16), (0, 10, 17)
 TRAFFIC_ALWAYS, TRAFFIC_ALWAYS_OFF, REVERSING_ALWAYS = range(8), (0, 1, 3, 7), (4, 5, 13, 22)
 TRAFFIC_ALWAYS_SUMO = (
     (2, hostile_traffic.drawn), (5, hostile_traffic.reversing), (9, hostile_traffic.signalled), (15, hostile_traffic.signalled),
-    (28, hostile_traffic.signalled),
+    (28, hostile_traffic.signalled), (20001, hostile_traffic.signalled),
 )  # fmt: skip
 
 

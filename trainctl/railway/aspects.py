@@ -5,7 +5,8 @@ or two after it has passed. So green counts for the first train before a signal 
 first, and has asked, for ``SETTLES`` steps; all others stop before the signal.
 
 Who sets the signals may think better of a green, even while a train can stop no more. So a train claims every signal that it will
-not be able to stop before by the next step: until it has passed, nobody else gets what it needs.
+not be able to stop before by the next step: until it has passed, nobody else gets what it needs, and nobody comes onto the track
+behind the signal. A green that was set while another came there is none yet.
 """
 
 from __future__ import annotations
@@ -82,6 +83,13 @@ def table(ways: Ways, internal: Bools, signals: Mapping[tuple[int, int], int]) -
     edge, onward = ways.edge[rows[:-1]][follows].tolist(), ways.edge[rows[1:]][follows].tolist()
     found[rows[:-1][follows] + 1] = [signals.get(pair, -1) for pair in zip(edge, onward, strict=True)]
     return found
+
+
+def block(ways: Ways, at: Ints, k: int) -> Ints:
+    """Edges from the signal at the beginning of row k up to the next one on that way, or its end; ``at`` (W,) from ``table``."""
+    end = int(ways.first[np.searchsorted(ways.first, k, side="right")])
+    signals = np.flatnonzero(at[k + 1 : end] >= 0)
+    return ways.edge[k : k + 1 + int(signals[0]) if len(signals) else end]
 
 
 def none(signals: int, trains: int) -> State:

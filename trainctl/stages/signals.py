@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trainctl.railway import aspects, supervisor
+from trainctl.railway import aspects, supervisor, zones
 from trainctl.railway.interlocking import EndOfAuthority
 from trainctl.railway.ways import Ways
 from trainctl.scenario.model import Model
-from trainctl.signals import Floats, Ints, Seen
+from trainctl.signals import Bools, Floats, Ints, Seen
 from trainctl.stages.record import Journal
 from trainctl.stages.traffic import State as Traffic
 from trainctl.world import SignalBox
@@ -46,6 +46,7 @@ class Signals:
         self.rate = np.minimum(p.driver_rules.service_mps2, p.relied_on_by_driver.braking)
         # How far ahead of a train that enters a signal may matter.
         self.entering = supervisor.stopping_distance(p.cruise, self.rate, p.scenario.run.step_s, p.step_theta) + BEYOND_M
+        self.length = p.consists.train_length()
         self.ways: Ways | None = None
 
     def initial(self) -> State:
@@ -86,9 +87,11 @@ class Signals:
         known = seen.present[sighted.train]
         signals, which = np.unique(sighted.signal[known], return_inverse=True)
         green[known] = box.green(signals)[which]
+        self._not_yet(t, ways, at, seen, traffic, sighted, green, s.aspects.claims)
         now, ends, told = aspects.decide(
             ways, sighted, green, seen.position, seen.present, ~traffic.standing, braking, binding, s.aspects
         )  # fmt: skip
+        self._keep_clear(ways, at, seen, traffic, sighted, now.claims, ends)
         ids, roster = self.p.scenario.ids, self.p.roster
         for one in (one for one in told if not roster.driven[one.train]):
             name = roster.signals[one.signal].name
@@ -115,6 +118,44 @@ class Signals:
         return aspects.decide(
             ways, sighted, none, seen.position, nobody, nobody, np.zeros(n), np.zeros(n), self.initial().aspects
         )[1]  # fmt: skip
+
+    def _not_yet(
+        self, t: float, ways: Ways, at: Ints, seen: Seen, traffic: Traffic, sighted: aspects.Sighted, green: Bools,
+        claims: list[list[int]],
+    ) -> None:  # fmt: skip
+        """Take for red what was set green while another train came onto the track behind it: it will be red in a step."""
+        back = traffic.standing & ~traffic.parked & (traffic.stands_until <= t + 1e-9)  # from where it was parked, perhaps
+        come = self._under(ways, seen, seen.present & (traffic.entering | back))
+        for k in np.flatnonzero(green).tolist() if come else ():
+            i, q = int(sighted.train[k]), int(sighted.signal[k])
+            if [i, q] not in claims and any(come.get(e, {i}) != {i} for e in aspects.block(ways, at, int(sighted.row[k])).tolist()):
+                green[k] = False
+
+    def _under(self, ways: Ways, seen: Seen, trains: Bools) -> dict[int, set[int]]:
+        """These trains, by the edges on which one of them shuts the track: under it, on the twins of those, and across."""
+        found: dict[int, set[int]] = {}
+        rails, length = self.p.rails, self.length
+        for i in np.flatnonzero(trains).tolist():
+            for k in zones.under(ways, seen.row, seen.position, length, i):
+                e = int(ways.edge[k])
+                for f in (e, int(rails.twin[e]), *rails.crossing[e]):
+                    found.setdefault(f, set()).add(i)
+        return found
+
+    def _keep_clear(
+        self, ways: Ways, at: Ints, seen: Seen, traffic: Traffic, sighted: aspects.Sighted, claims: list[list[int]],
+        ends: EndOfAuthority,
+    ) -> None:  # fmt: skip
+        """Keep trains that are not on the track off what others run onto that can stop before it no more: they would get red."""
+        outside = (traffic.parked | ~traffic.came) & ~self.p.roster.driven
+        if not claims or not outside.any():
+            return
+        places = self._under(ways, seen, outside)
+        for i, q in claims:
+            (k,) = sighted.row[(sighted.train == i) & (sighted.signal == q)][:1]
+            for e in aspects.block(ways, at, int(k)).tolist():
+                for j in places.get(e, ()):
+                    ends.room[j], ends.zone[j], ends.by[j] = 0.0, e, i
 
     def _binding(self, speed: Floats) -> Floats:
         """How far from here every train may come to a stand that is told to stop one step later [m], shape (n,)."""

@@ -41,7 +41,7 @@ class Line:
         self.seen = self.loop.world.measure()._replace(present=np.ones(2, bool))
         self.first = next(k for k, s in enumerate(p.roster.signals) if (s.edge, s.onward) == ("left", "up1"))
 
-    def step(self, *rooms, speed=20.0, standing=(False, False)):
+    def step(self, *rooms, speed=20.0, standing=(False, False), **traffic):
         """What is said of trains that have so much way to the first signal."""
         begin = self.ways.start
         at = self.signal_at()
@@ -49,7 +49,7 @@ class Line:
         assert (position > begin).all()
         rows = np.array([int(np.searchsorted(self.ways.begin[a:b], x, side="right")) - 1 + a for a, b, x in self.spans(position)])
         seen = self.seen._replace(position=position, row=rows, edge=self.ways.edge[rows])
-        going = self.traffic._replace(came=np.ones(2, bool), stands_until=np.where(standing, 60.0, np.nan))
+        going = self.traffic._replace(came=np.ones(2, bool), stands_until=np.where(standing, 60.0, np.nan))._replace(**traffic)
         self.state, found = self.loop.signals.step(7.0, self.ways, seen, np.full(2, speed), going, self.box, self.state)
         return found
 
@@ -98,6 +98,33 @@ def test_a_green_taken_back_inside_the_braking_distance_is_told_and_a_red_passed
     line.told.clear()
     line.step(-5.0, 2900.0)
     assert line.told.kinds() == [("red_passed", "a")]
+
+
+def test_nobody_comes_onto_the_track_behind_a_signal_that_a_train_can_stop_before_no_more(line):
+    line.box.shown = set(range(len(line.loop.p.roster.signals)))
+    parked, ahead = np.array([False, True]), -300.0  # train b, beyond the signal
+    for _ in range(SETTLES + 1):
+        found = line.step(1200.0, ahead, parked=parked)
+    assert found.room[0] == np.inf and found.room[1] > 0.0  # train a can still stop
+    found = line.step(100.0, ahead, parked=parked)
+    assert line.state.aspects.claims == [[0, line.first]]
+    assert (found.room[1], found.by[1]) == (0.0, 0)
+    beyond = line.step(90.0, -6000.0, parked=parked)
+    assert beyond.room[1] != 0.0  # behind the next signal
+
+
+def test_a_green_set_while_another_came_onto_the_track_behind_the_signal_does_not_count(line):
+    line.box.shown = set(range(len(line.loop.p.roster.signals)))
+    come = {"entering": np.array([False, True])}
+    for _ in range(SETTLES + 1):
+        found = line.step(1200.0, -300.0, **come)
+    assert found.room[0] == 1200.0 - STANDS_BEFORE_M
+    back = line.step(1200.0, -300.0, stands_until=np.array([np.nan, 7.0]))  # comes back from where it was parked
+    assert back.room[0] == 1200.0 - STANDS_BEFORE_M
+    assert line.step(1200.0, -300.0).room[0] == np.inf
+    line.step(100.0, -6000.0)
+    assert line.state.aspects.claims == [[0, line.first]]
+    assert line.step(90.0, -300.0, **come).room[0] == np.inf  # too late to take it for red
 
 
 def test_who_stands_at_a_red_signal_is_told_once_with_the_reason(line):
