@@ -11,6 +11,7 @@ Numeric backend, supervisor on, rows every 60 s. Times are those of the processo
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import statistics
@@ -137,6 +138,7 @@ def table(found: list[dict[str, Any]]) -> str:
 def of_roster(folder: Path, kind: list[str]) -> None:
     """What runs in a process of its own."""
     os.environ.setdefault("TRAINCTL_THREADS", "1")
+    gc.set_threshold(50_000)  # as in the program
     if kind:
         print(json.dumps(whole(folder)))
     else:

@@ -47,10 +47,14 @@ def ways(routes: Sequence[Sequence[int] | Ints], start_m: Floats, length_m: Floa
         rounding it is taken as it is, so that trains on one line have the very same positions.
     """
     parts = [np.asarray(route, np.int64) for route in routes]
+    begins: dict[bytes, Floats] = {}  # many trains run over one route
+    for part in parts:
+        if (key := part.tobytes()) not in begins:
+            begins[key] = _begins(part, float(start_m[part[0]]), start_m, length_m)
     return Ways(
         first=np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64),
         edge=np.concatenate([*parts, np.zeros(0, np.int64)]),
-        begin=np.concatenate([*(_begins(part, float(start_m[part[0]]), start_m, length_m) for part in parts), np.zeros(0)]),
+        begin=np.concatenate([*(begins[part.tobytes()] for part in parts), np.zeros(0)]),
     )
 
 

@@ -83,11 +83,15 @@ def unguarded(ways: Sequence[Ints], ids: Sequence[str], rails: Rails, signals: S
     A train that begins there needs none: SUMO does not let it in before the place is free.
     """
     stands = {(rails.index.get(s.edge, -1), rails.index.get(s.onward, -1)) for s in signals}
-    users: dict[int, set[int]] = {}
-    over: dict[int, set[int]] = {}  # edges that lead into each, as far as trains come over them
+    alike: dict[bytes, list[int]] = {}  # trains by their ways
     for i, way in enumerate(ways):
+        alike.setdefault(way.tobytes(), []).append(i)
+    users: dict[int, set[int]] = {}  # two of them, where there are as many
+    over: dict[int, set[int]] = {}  # edges that lead into each, as far as trains come over them
+    for trains in alike.values():
+        way = ways[trains[0]]
         for edge in set(way.tolist()):
-            users.setdefault(edge, set()).add(i)
+            users.setdefault(edge, set()).update(trains[:2])
         for a, b in zip(way[:-1].tolist(), way[1:].tolist(), strict=True):
             over.setdefault(b, set()).add(a)
     single = {
@@ -95,9 +99,10 @@ def unguarded(ways: Sequence[Ints], ids: Sequence[str], rails: Rails, signals: S
         for e in users
         if any(len(users[e] | users[other]) > 1 for other in (int(rails.twin[e]), *rails.crossing[e]) if other in users)
     }
-    found: dict[int, list[str]] = {}
-    for name, way in zip(ids, ways, strict=True):
-        guarded, last = False, int(way[0])
+    bare: dict[bytes, list[int]] = {}
+    for key, trains in alike.items():
+        way = ways[trains[0]]
+        bare[key], guarded, last = [], False, int(way[0])
         begun = last in single  # still on the stretch it begins on
         for k, edge in enumerate(way.tolist()):
             if k and not guarded:
@@ -106,9 +111,13 @@ def unguarded(ways: Sequence[Ints], ids: Sequence[str], rails: Rails, signals: S
             begun &= edge in single
             shared = (k > 0 and len(over[edge]) > 1 and len(users[edge]) > 1) or edge in single
             if shared and not guarded and not begun and k > 0:
-                found.setdefault(edge, []).append(name)
+                bare[key].append(edge)
             last = edge
-    named = [f"before edge {rails.edges[e]} for train {_some(trains)}" for e, trains in found.items()]
+    found: dict[int, list[str]] = {}
+    for name, way in zip(ids, ways, strict=True):
+        for edge in bare[way.tobytes()]:
+            found.setdefault(edge, []).append(name)
+    named = [f"before edge {rails.edges[e]} for train {_some(names)}" for e, names in found.items()]
     return named if len(named) <= MOST else [*named[:MOST], f"before {len(named) - MOST} more edges"]
 
 

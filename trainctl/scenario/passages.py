@@ -71,11 +71,17 @@ def without_solution(
     """
     net = along.net(rails)
     found = list[str]()
+    met = dict[tuple[float | bytes, ...], list[int]]()  # edges on which trains meet themselves, by length and way
     for i, parts in enumerate(legs):
-        ways = laid(parts, rails.start_m, rails.length_m)
-        for _, row in solvable.meets_itself(ways, net, np.full(len(parts), length[i])):
-            edge = rails.edges[ways.edge[row]]
-            found.append(f"network.sumocfg: train {ids[i]}: {length[i]:g} m long, meets itself on edge {edge}: its loop is shorter")
+        alike = (length[i], *(part.tobytes() for part in parts))
+        if alike not in met:
+            ways = laid(parts, rails.start_m, rails.length_m)
+            rows = [row for _, row in solvable.meets_itself(ways, net, np.full(len(parts), length[i]))]
+            met[alike] = ways.edge[rows].tolist()
+        found += [
+            f"network.sumocfg: train {ids[i]}: {length[i]:g} m long, meets itself on edge {rails.edges[e]}: its loop is shorter"
+            for e in met[alike]
+        ]
     if found or not orders:
         return ([] if may_change else found), []
     said = f"order: whether all trains can get out as the {len(orders)} orders say"

@@ -6,6 +6,7 @@ import fnmatch
 import math
 import tempfile
 from collections.abc import Collection, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -214,11 +215,12 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
     edges = list[list[Ints]]()  # of the legs of all trains
     placed_m = list[float]()
     factor = np.array([min(traffic.kinds[d.kind].speed_factor, 1.0) for d in traffic.departures])
+    way_of = cache(rails.way)  # many trains run over one route
     for d, share, other in zip(traffic.departures, factor.tolist(), driven.tolist(), strict=True):
         try:
             # Trains of SUMO's own turn by themselves.
             cuts = frozenset() if other else rails.reversal
-            parts = [np.array(leg, np.int64) for leg in turning.legs(rails.way(d.edges).tolist(), cuts)]
+            parts = [np.array(leg, np.int64) for leg in turning.legs(way_of(d.edges).tolist(), cuts)]
             begins = [rails.start_m[w[0]] + np.concatenate([[0.0], np.cumsum(rails.length_m[w[:-1]])]) for w in parts]
             yards = _yards(parts, begins, rails, types.get(d.kind))
             found += _too_long(d.id, parts, yards, rails, types.get(d.kind))
@@ -254,7 +256,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         )  # fmt: skip
     given, told = None, list[str]()
     if not found and scenario.controller.law != "sumo":
-        bare = mixed.unguarded([rails.way(d.edges) for d in traffic.departures], ids, rails, traffic.signals)
+        bare = mixed.unguarded([way_of(d.edges) for d in traffic.departures], ids, rails, traffic.signals)
         choice, told, wrong = mixed.chosen(driving, together, traffic.signals, bare)
         found += wrong
         if choice == "obey":

@@ -89,11 +89,12 @@ def refuse(sumocfg: Path, net: Path, trains: list[Element], elements: Elements, 
             wrong.append(f"{who}: route = {train.get('route')}: no such route")
         ends = [*train.get("from", "").split(), *train.get("via", "").split(), *train.get("to", "").split()]
         wrong += [f"{who}: edge {e}: not in the net" for e in ends if e not in tracks.onward]
-        wrong += [f"{who}: {m}" for s in train.iter("stop") if (m := place_of(s, elements, tracks).wrong)]
+        own = {id(s): place_of(s, elements, tracks) for s in train.iter("stop")}
+        wrong += [f"{who}: {p.wrong}" for p in own.values() if p.wrong]
         for route in routes:
             wrong += [f"{who}: {m}" for m in unconnected(route.get("edges", "").split(), tracks)]
             stops = [*route.iter("stop"), *(s for s in train if s.tag == "stop")]
-            places = [place_of(s, elements, tracks) for s in stops]
+            places = [own.get(id(s)) or place_of(s, elements, tracks) for s in stops]
             wrong += [f"{who}: {p.wrong}" for p in places if p.wrong]
             if not {"repeat", "departEdge", "arrivalEdge"} & {*route.keys(), *train.keys()} and not any(p.wrong for p in places):
                 wrong += [f"{who}: {m}" for m in off_route(tuple(route.get("edges", "").split()), places)]

@@ -187,6 +187,7 @@ def is_number(text: str) -> bool:
         return False
 
 
+@lru_cache(maxsize=1 << 16)
 def is_time(text: str) -> bool:
     """Whether a text is a time that ``seconds`` reads."""
     try:
