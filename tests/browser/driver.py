@@ -70,6 +70,12 @@ class Browser:
             time.sleep(0.1)
         return value
 
+    def narrow(self, width: int, height: int) -> None:
+        """The window as it would be on a screen of another size, smaller than a window can be made."""
+        command = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 640}
+        body = {"cmd": "Emulation.setDeviceMetricsOverride", "params": command}
+        self._post(f"/session/{self.session}/goog/cdp/execute", body)
+
     def press(self, keys: str) -> None:
         """Type keys into what has the focus."""
         actions = [{"type": action, "value": key} for key in keys for action in ("keyDown", "keyUp")]

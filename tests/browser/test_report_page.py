@@ -211,3 +211,34 @@ def test_a_page_without_animation_is_alive(browser, tmp_path):
     browser.press(" ")
     assert browser.run("return document.querySelectorAll('.plot').length") >= 4
     assert browser.complaints() == []
+
+
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("width", [390, 800, 1280])
+def test_nothing_lies_on_anything_else_and_everything_fits(page, width, dark):
+    """What a reader of the page stumbled on: tools over bounds, names over names, columns beyond their box, keys too small to hit."""
+    with Browser(1280, 900, dark) as browser:
+        browser.narrow(width, 844)
+        browser.open(page)
+        browser.until(READY)
+        assert browser.run("return document.documentElement.scrollWidth") == width
+        tools = browser.run("""
+            return [...document.querySelectorAll('.plot')].map(p => {
+                const bar = p.querySelector('.modebar'), words = [...p.querySelectorAll('.annotation text')].map(w => w.getBoundingClientRect());
+                const box = bar.getBoundingClientRect(), floor = p.querySelector('.draw')._fullLayout._size.t;
+                return [p.id, box.bottom - p.querySelector('.draw').getBoundingClientRect().top - floor, words.filter(w => w.top < box.bottom - 1 && w.right > box.left).length];
+            })""")
+        assert [(name, over) for name, over, _ in tools if over > 0] == []
+        assert [(name, words) for name, _, words in tools if words] == []
+        places = browser.run(
+            "return [...document.querySelectorAll('#plot-graph .annotation text')].map(t => t.getBoundingClientRect()).map(r => [r.top, r.bottom])"
+        )
+        (first, second) = sorted(places)
+        assert second[0] >= first[1] - 2, "names of places"
+        assert browser.run("const t = document.querySelector('.states'); return t.scrollWidth <= t.clientWidth")
+        sizes = browser.run(
+            "return [...document.querySelectorAll('button:not(.link), select')].map(b => b.getBoundingClientRect().height)"
+        )
+        assert min(sizes) >= 24
+        units = browser.run("return [...document.querySelectorAll('.plot h3 .unit')].filter(u => u.offsetWidth > 0).length")
+        assert (units > 0) == (width == 390), "the unit stands at the axis, or in the title where there is no room"

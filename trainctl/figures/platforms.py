@@ -1,4 +1,4 @@
-"""Which train stands at which platform, and when: the timetable of the stations, planned against actual."""
+"""Which train is stopped at which platform, and when: the timetable of the stations, planned against actual."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def platforms(drawn: Drawn) -> Figure:
     if left_out:
         panel.set_title(f"the {len(kept)} busiest platforms; {left_out} more are in stops.parquet", fontsize=7, loc="left")
     style.legend(figure, drawn.width, [
-        Patch(facecolor="#999999", alpha=0.7, label="stands"),
+        Patch(facecolor="#999999", alpha=0.7, label="stopped"),
         Line2D([], [], color="black", linewidth=0.9, linestyle=(0, (3, 1.5)), label="planned"),
     ])  # fmt: skip
     return figure
@@ -61,7 +61,7 @@ def _draw(panel: Axes, row: int, name: str, times: list[float], last: float, dra
     if not np.isfinite(came):
         return  # it did not come
     until = left if np.isfinite(left) else last
-    panel.broken_barh([(came, until - came)], (bottom, BAR), facecolor=colour, alpha=0.7, linewidth=0.0, gid=f"stands {name}")
+    panel.broken_barh([(came, until - came)], (bottom, BAR), facecolor=colour, alpha=0.7, linewidth=0.0, gid=f"stopped {name}")
     shown = last - float(drawn.instants[0])
     inside = until - came > SHORT * shown
     panel.text(

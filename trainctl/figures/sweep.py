@@ -10,7 +10,7 @@ import numpy as np
 
 from trainctl.figures import style
 from trainctl.figures.heat import ROUNDING, heat, two_settings
-from trainctl.signals import Bools
+from trainctl.signals import Bools, Floats
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -49,6 +49,17 @@ def _crosses(panel: Axes, at: Any) -> None:
             label="not settled",
         )  # fmt: skip
         panel.set_title(f"{len(at)} not settled by the end", loc="right", fontsize=7)
+
+
+def _scale_of_one(panel: Axes, value: Floats) -> None:
+    """Where all runs have one value, up to rounding, the scale shows that value and 0; where none has a value there is no scale."""
+    if not len(value):
+        panel.set_yticks([])
+    elif np.ptp(value) < ROUNDING:
+        only = float(value[0])
+        size = max(abs(only), ROUNDING)
+        panel.set_ylim(min(only, 0.0) - 0.4 * size, max(only, 0.0) + 0.4 * size)
+        panel.set_yticks([0.0] if size <= ROUNDING else [0.0, only])
 
 
 def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
@@ -101,11 +112,9 @@ def summary(frame: pd.DataFrame, parameters: Sequence[str], path: Path) -> None:
                 if chosen.any():
                     panel.plot(at[chosen], value[chosen], ".", markersize=3, color=style.COLOURS[colour], label=label)
             _crosses(panel, at[never])
-            minimum, most = (np.nanmin(value), np.nanmax(value)) if np.isfinite(value).any() else (0.0, 0.0)
-            if most - minimum < ROUNDING:
-                panel.set_ylim(minimum - 1.0, most + 1.0)
             if key.startswith("bounds."):
                 panel.axhline(0.0, color="black", linestyle="--", linewidth=0.6)
+            _scale_of_one(panel, value[np.isfinite(value)])
             panel.set_ylabel(SHOWN[key])
         axes[0].set_title(title, loc="left")
         axes[-1].set_xlabel("runs in order of size" if axis is None else axis)

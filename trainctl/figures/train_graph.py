@@ -21,7 +21,7 @@ from trainctl.signals import Floats
 
 #: Marks on a train's own line where trains come and go, and their words.
 MARKS = {
-    "couple": ("^", "couples"), "uncouple": ("v", "uncouples"), "stop_reached": ("s", "stops"),
+    "couple": ("^", "joins a formation"), "uncouple": ("v", "leaves it"), "stop_reached": ("s", "stops"),
     "conflict": ("D", "waits for its turn"), "reroute": ("o", "new route"), "reroute_refused": ("x", "route refused"),
     "supervisor": ("|", "supervisor acts"), "brake": ("<", "ordered to brake"),
 }  # fmt: skip

@@ -151,12 +151,13 @@ def _worst_after_start(time: Floats, error: Floats) -> float:
 def _bands(panel: Axes, drawn: Drawn, value: Floats, low: Floats, high: Floats) -> None:
     """Lines in the colour of their train, lighter for later units, with their extremes as a shade; trains in the legend."""
     time, shown = drawn.units.column("time_s"), set()
+    labels = dict(zip(drawn.names, style.labels(drawn.names, "train "), strict=True))
     for name, rows in drawn.units.slices():
         if not np.isfinite(value[rows]).any():
             continue
         train, _, unit = name.rpartition(".")
         colour = drawn.colour[train]
-        label = f"train {train}" if train not in shown else f"_{name}"
+        label = labels[train] if train not in shown else f"_{name}"
         shown.add(train)
         if np.any(low[rows] < high[rows]):
             (x, minimum), (_, maximum) = _floor(time[rows], low[rows], -1.0), _floor(time[rows], high[rows], 1.0)
@@ -187,7 +188,7 @@ def _over_time(drawn: Drawn, column: str, label: str, scale: float, derivative: 
 
 
 def _between_trains(panel: Axes, drawn: Drawn, column: str, scale: float) -> None:
-    """Tail unit of the train ahead minus head unit, for every link between them."""
+    """Rear unit of the train ahead minus leading unit, for every link between them."""
     rows = dict(drawn.units.slices())
     tails: dict[str, str] = {name.rpartition(".")[0]: name for name in rows}  # units are in order: the last one stays
     value, time = drawn.units.column(column), drawn.units.column("time_s")

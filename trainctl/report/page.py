@@ -38,8 +38,8 @@ BOUNDS = {
 FIGURES = {
     "Formation": {
         "formation.settling_s": "all links within 1 m from",
-        "formation.last_link_s": "last link at",
-        "formation.final_error_m": "largest spacing error at the last link",
+        "formation.last_link_s": "last recorded link",
+        "formation.final_error_m": "largest spacing error at that time",
         "formation.final_speed_error_mps": "largest speed error at the end",
         "string.l2_gain": "growth of the spacing error from link to link",
     },
@@ -72,7 +72,7 @@ BAD: dict[str, tuple[Callable[[float], bool], str]] = {
 
 #: In place of the animation.
 NO_FILM = (
-    '<p class="keys">There is no animation: a run without SUMO does not know where the tracks of its net lie. The plots below show'
+    '<p class="keys">There is no animation: without SUMO, a run does not know where the tracks of its net lie. The plots below show'
     " every train.</p>"
 )
 
@@ -202,14 +202,12 @@ def _not_followed(run: Run) -> str:
     """What the files of a SUMO configuration say and the run did not do, one line each."""
     lines = [str(e["what"]) for e in run.events if e["kind"] == "not_followed"]
     rows = "".join(f"<li>{escape(line)}</li>" for line in lines)
-    summary_line = (
-        f"<summary>{len(lines)} {'thing' if len(lines) == 1 else 'things'} in SUMO's files not followed as they stand</summary>"
-    )
+    summary_line = f"<summary>Not followed exactly: {len(lines)} {'line' if len(lines) == 1 else 'lines'} of SUMO's files</summary>"
     return f"<details class=left>{summary_line}<ul>{rows}</ul></details>" if lines else ""
 
 
 def _verdict(values: Mapping[str, Any], run: Run) -> str:
-    """All bounds held, or which broke first, where and when."""
+    """All bounds held, or which was violated first, where and when."""
     margins = _margins(values)
     violated = [words for words, _, margin, _ in margins if margin < -SLACK]
     if not margins:
@@ -231,7 +229,7 @@ def _bounds(values: Mapping[str, Any]) -> str:
         held = margin >= -SLACK
         shown = "0" if abs(margin) <= SLACK else three(margin)
         rows.append(
-            f"<tr><th scope=row>{words}</th><td class=n>{shown}</td><td>{unit}</td><td>{escape(whose)}</td>"
+            f"<tr><th scope=row>{words}</th><td class=n>{shown}</td><td>{unit}</td><td class=whose>{escape(whose)}</td>"
             f'<td class="{"held" if held else "broken"}">{"held" if held else "⚠ violated"}</td></tr>'
         )
     return "".join(rows)
@@ -269,7 +267,7 @@ def _figures(values: Mapping[str, Any]) -> str:
         for name in found:
             value, (unit, definition) = values[name], DEFINITIONS.get(name, ("", ""))
             rule, reason = BAD.get(name, (lambda v: False, ""))
-            bad = "not by the last link" if value is None else reason if rule(value) else ""
+            bad = "not while there were links" if value is None else reason if rule(value) else ""
             mark = f"<td class=broken>⚠ {bad}</td>" if bad else "<td></td>"
             shown = value if isinstance(value, int | float) or value is None else escape(str(value))
             rows.append(

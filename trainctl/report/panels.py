@@ -34,6 +34,14 @@ POINTS = (2000, 120)
 SHADED = 300
 #: Dashes of the library per track, by name, as ``style.TRACK_STYLES``.
 DASHES = ("solid", "8px,3px", "2px,3px", "8px,3px,2px,3px")
+#: Words for them.
+LOOKS = ("full", "dashed", "dotted", "dash-dotted")
+#: Of panels with the reference.
+THE_REFERENCE = "Dotted in the colour of the text: the reference."
+#: Letters of an event at most, and of a list in it so many words in full.
+LETTERS, MANY = 300, 12
+#: Ends of keys that are units, longer ones first: end, unit.
+UNITS = (("_mps2", "m/s²"), ("_mps", "m/s"), ("_kwh", "kWh"), ("_s", "s"), ("_m", "m"))
 #: More different bounds than this in one panel are not drawn.
 BOUNDS = 6
 
@@ -147,10 +155,17 @@ def _train_graph(drawn: Drawn) -> Iterator[Panel]:
                 ))  # fmt: skip
         if reference is not None and name == "graph":
             traces.append(_reference(drawn, leader_over(reference, drawn.instants)[0] / 1000))
-        note = "One colour per train, one dash per track." if name == "graph" else ""
+        note = _of_tracks(tracks, reference is not None) if name == "graph" else ""
         note = f"{note} {held.words}".strip() if shaded else note
         here = _places(crossovers(drawn.run, drawn.trains)) if name == "graph" else []
         yield panel(name, title, unit, traces, note=note, places=here)
+
+
+def _of_tracks(tracks: list[str], reference: bool) -> str:
+    """What the lines of a train graph mean: dashes of tracks, where there are several, and the reference."""
+    looks = [f"{LOOKS[k % len(LOOKS)]} on track {name}" for k, name in enumerate(tracks)]
+    words = f"One colour per train: {', '.join(looks)}." if len(tracks) > 1 else "One colour per train."
+    return f"{words} {THE_REFERENCE}" if reference else words
 
 
 def _corridors(drawn: Drawn) -> Iterator[Panel]:
@@ -227,7 +242,7 @@ def _places(found: tuple[Place, ...]) -> list[dict[str, Any]]:
 #: Of panels of links.
 OF_LINKS = "A link has the colour of its train behind."
 #: Of panels of trains that come and go.
-IN_AND_OUT = "Full where the train is in a formation, dotted where it is not; no line where it is not there."
+IN_AND_OUT = "Full where the train is in a formation, dotted where it is not; no line where it is not on the net."
 
 
 def _in_and_out(drawn: Drawn, value: Floats) -> Iterator[Trace]:
@@ -255,6 +270,8 @@ def _speeds(drawn: Drawn) -> Panel:
     if drawn.known.cruise_mps is not None:
         bounds.append({"value": factor * drawn.known.cruise_mps, "name": "cruising speed", "dash": "dot"})
     note = f"{IN_AND_OUT} Bounds are those of trains in formations." if drawn.known.traffic else ""
+    if drawn.known.reference is not None:
+        note = f"{note} {THE_REFERENCE}".strip()
     return panel("speeds", "Speeds against bounds", f"speed [{drawn.speed_unit}]", traces, bounds=bounds, note=note)
 
 
@@ -430,8 +447,18 @@ def told(event: dict[str, Any]) -> str:
         if key in ("time_s", "kind") or value in ([], None):
             continue
         if key == "edges":
-            value = " ".join("-".join(map(str, edge)) for edge in value)
+            value = _ends(["-".join(map(str, edge)) for edge in value], " ", "links")
         elif key == "formations":
-            value = " | ".join(" ".join(map(str, group)) for group in value)
-        parts.append(f"{key} {value:.6g}" if isinstance(value, float) else f"{key} {value}")
-    return ", ".join(parts)[:300]
+            value = _ends([_ends(list(map(str, group)), " ", "trains") for group in value], " | ", "formations")
+        name, unit = next(((key.removesuffix(end), f" {unit}") for end, unit in UNITS if key.endswith(end)), (key, ""))
+        shown = f"{value:.6g}" if isinstance(value, float) else str(value)
+        parts.append(f"{'links' if name == 'edges' else name.replace('_', ' ')} {shown}{unit}")
+    line = ", ".join(parts)
+    return line if len(line) <= LETTERS else f"{line[: LETTERS - 1]}…"
+
+
+def _ends(words: list[str], between: str, what: str) -> str:
+    """All words, or of many the first and the last ones and how many there are."""
+    if len(words) <= MANY:
+        return between.join(words)
+    return between.join([*words[:3], "…", *words[-2:]]) + f" ({len(words)} {what})"

@@ -72,9 +72,9 @@ def test_a_bar_for_every_stop_and_a_frame_for_its_plan(terminal):
     frames = {line.get_gid(): line.get_xdata() for line in panel.lines if str(line.get_gid()).startswith("planned")}
     calls = terminal.stops.astype({"train": str}).set_index("train")
     for train in ("t0", "t1"):
-        bar = bars[f"stands {train}"]
+        bar = bars[f"stopped {train}"]
         assert (bar.x0, bar.x1) == pytest.approx((calls.arrival_s[train], calls.departure_s[train]))
-    assert bars["stands t2"].x1 == 900.0  # it is still there
+    assert bars["stopped t2"].x1 == 900.0  # it is still there
     assert (min(frames["planned t0"]), max(frames["planned t0"])) == (330.0, 400.0)
     rows = {name: round(float(bar.y0 + bar.y1) / 2) for name, bar in bars.items()}
-    assert rows == {"stands t0": 0, "stands t1": 1, "stands t2": 0}
+    assert rows == {"stopped t0": 0, "stopped t1": 1, "stopped t2": 0}

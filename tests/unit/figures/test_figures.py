@@ -232,6 +232,13 @@ def test_of_many_trains_the_graph_shows_what_each_gained(tmp_path: Path) -> None
     assert absolute.get_position().height < gained.get_position().height
 
 
+def test_of_many_trains_the_figures_of_units_name_a_few(tmp_path: Path) -> None:
+    (panel,) = figure(made_up(tmp_path, "emu_finite_time", trains=40, units=2), "unit_forces").axes
+    named = [text for text in panel.texts if text.get_text().startswith("train ")]
+    assert 4 <= len(named) <= style.NAMED
+    assert np.diff(sorted(text.xy[1] for text in named)).min() > 0.9 * style.line_share(panel)
+
+
 def test_every_numbered_figure_exists() -> None:
     papers = [shipped(name) for name in ("fully_distributed", "robust_constrained", "emu_finite_time", "fault_tolerant")]
     assert all(law.FIGURES and law.FIGURES.keys() <= FIGURES.keys() for law in papers)

@@ -168,7 +168,7 @@ def test_a_run_without_sumo_has_a_page_without_animation(numeric, tmp_path):
     with pytest.raises(InputError, match="nothing to draw the trains on"):
         film(numeric, tmp_path / "film.gif")
     text = page(numeric)
-    assert "There is no animation: a run without SUMO" in text
+    assert "There is no animation: without SUMO" in text
     assert "<div hidden>" in text
 
 

@@ -48,6 +48,17 @@ def test_runs_that_did_not_settle_are_shown_and_counted(tmp_path: Path) -> None:
     assert "4 not settled by the end" in (tmp_path / "none.svg").read_text()
 
 
+def test_where_all_runs_have_one_value_the_scale_shows_it_and_zero(tmp_path: Path) -> None:
+    """A coupler has 0.1 m of room in all runs: that is neither 1 m nor -0.9 m; and no time at all is not 0 s."""
+    frame = pd.DataFrame({
+        "run.seed": range(3), "topology.loss": [0.0, 0.1, 0.2], "status": "complete", "violations": 0,
+        "bounds.coupler_lower_margin_m": 0.1, "formation.settling_s": np.nan, "formation.final_error_m": 9.0,
+    })  # fmt: skip
+    summary(frame, ["topology.loss"], tmp_path / "summary.svg")
+    scales = re.findall(r'<g id="ytick_\d+">.*?<text[^>]*>([^<]*)</text>', (tmp_path / "summary.svg").read_text(), re.S)
+    assert scales == ["0.0", "0.1", "0", "9"]  # the room, nothing of the times, the error
+
+
 def over_two(**more: list[float | None]) -> pd.DataFrame:
     """Four cells with two runs each."""
     return pd.DataFrame({

@@ -104,7 +104,7 @@ def test_verdict_says_what_broke_first_and_where(finished, text):
     assert re.search(
         r"1 of \d kinds of bound violated.</strong> First at 989 s: lower spacing bound \[m\] of link of 4-5", violated
     )
-    assert '<td>4-5</td><td class="broken">⚠ violated</td>' in violated
+    assert '<td class=whose>4-5</td><td class="broken">⚠ violated</td>' in violated
 
 
 def test_metrics_are_words_with_three_digits_and_bad_ones_are_marked(text):
@@ -186,7 +186,24 @@ def test_names_cannot_break_out_of_the_page(tmp_path):
 
 def test_an_event_is_one_line():
     event = {"time_s": 1.0, "kind": "topology", "edges": [["1", "3"]], "formations": [["1", "3"], ["2"]], "start_condition": []}
-    assert told(event) == "edges 1-3, formations 1 3 | 2"
+    assert told(event) == "links 1-3, formations 1 3 | 2"
+    assert told({"time_s": 0, "kind": "depart", "train": "7", "delay_s": 2.0, "speed_mps": 36.0, "switch_m": 1.5}) == (
+        "train 7, delay 2 s, speed 36 m/s, switch 1.5 m"
+    )
+
+
+def test_of_a_fleet_an_event_names_the_first_and_the_last_and_says_how_many():
+    names = [str(k) for k in range(1, 101)]
+    line = told({"time_s": 0.0, "kind": "topology", "edges": list(itertools.pairwise(names)), "formations": [names]})
+    assert line == "links 1-2 2-3 3-4 … 98-99 99-100 (99 links), formations 1 2 3 … 99 100 (100 trains)"
+    cut = told({"time_s": 0.0, "kind": "not_followed", "what": "x" * 1000})
+    assert len(cut) == 300 and cut.endswith("x…")
+
+
+def test_the_train_graph_says_what_its_dashes_mean(run):
+    notes = {panel["id"]: panel.get("note", "") for panel in panels(drawable(run))}
+    assert notes["graph"].startswith("One colour per train: full on track 1, dashed on track 2, dotted on track 3.")
+    assert all("the reference." in notes[name] for name in ("graph", "speeds"))
 
 
 def test_a_run_without_trains_or_a_wrong_place_is_told(tmp_path):

@@ -35,11 +35,45 @@
   };
   const narrow = () => innerWidth < 640;
 
+  const inner = () => narrow() ? 210 : 250; // height of a plot within its axes [px], about
+  function extent(panel) { // of what is drawn in a panel, and of its places
+    let low = Infinity, high = -Infinity;
+    for (const t of panel.traces) if (t.y.bdata) for (const y of floats(t.y)) { if (y < low) low = y; if (y > high) high = y; }
+    for (const p of panel.places || []) { low = Math.min(low, p.value); high = Math.max(high, p.value); }
+    return [low, high];
+  }
+
+  // places by name: a name above its line, below it where another is near above, and none where neither has room
+  function named(panel) {
+    if (!(panel.places || []).length) return [];
+    const [low, high] = extent(panel), apart = 17 / inner() * (high - low), taken = [], found = [];
+    for (const p of [...panel.places].sort((a, b) => (b.stop || 0) - (a.stop || 0) || b.value - a.value)) {
+      const side = [1, -1].find((s) => taken.every((y) => Math.abs(y - (p.value + s * apart / 2)) >= apart));
+      if (!side) continue;
+      taken.push(p.value + side * apart / 2); found.push({ ...p, below: side < 0 });
+    }
+    return found;
+  }
+
+  // which words of a panel keep clear of those before them, on the whole time axis
+  function clear_words(panel) {
+    const words = panel.traces.filter((t) => t.words), kept = new Set(), room = [];
+    if (!words.length) return kept;
+    const [low, high] = extent(panel), wide = at("plots").clientWidth - (narrow() ? 60 : 134), tall = inner();
+    for (const p of named(panel)) room.push({ x: 7 * p.name.length, y: (p.value - low) / (high - low || 1) * tall + (p.below ? -14 : 0), length: 7 * p.name.length });
+    for (const t of words) {
+      const x = (t.x[0] - whole[0]) / (whole[1] - whole[0] || 1) * wide, y = (t.y[0] - low) / (high - low || 1) * tall, length = 7 * t.text[0].length + 6;
+      if (x < length || room.some((r) => Math.abs(r.y - y) < 13 && x - length < r.x && x > r.x - r.length)) continue;
+      room.push({ x, y, length }); kept.add(t);
+    }
+    return kept;
+  }
+
   function traces(panel) {
-    const many = panel.traces.filter((t) => !t.band).length > 60;
+    const many = panel.traces.filter((t) => !t.band).length > 60, clear = clear_words(panel);
     return panel.traces.map((t) => {
       if (t.points) return { type: "scatter", mode: "markers", x: t.x, y: t.y, text: t.text, name: t.name, marker: { color: shown(t.color), size: 9, symbol: "diamond" }, hovertemplate: "%{x:g} s: %{y}<br>%{text}<extra></extra>" };
-      if (t.words) return { type: "scatter", mode: "text", x: t.x, y: t.y, text: t.text.map((w) => `<b>${safe(w)}</b>`), textfont: { color: shown(t.color), size: 11 }, textposition: "top left", hoverinfo: "skip", visible: drawn_now(t) };
+      if (t.words) return { type: "scatter", mode: "text", x: t.x, y: t.y, text: t.text.map((w) => `<b>${safe(w)}</b>`), textfont: { color: shown(t.color), size: 11 }, textposition: "top left", hoverinfo: "skip", visible: drawn_now(t), opacity: clear.has(t) ? 1 : 0 };
       return {
         type: "scatter", mode: t.rings ? "lines+markers" : "lines", x: t.x, y: t.y, name: t.name, connectgaps: false, opacity: t.alpha || 1, visible: drawn_now(t),
         line: { color: shown(t.color), width: t.fill === "self" ? 0.5 : t.band ? 0 : many ? 0.8 : 1.6, dash: t.dash || "solid", shape: t.step ? "hv" : "linear" },
@@ -66,15 +100,15 @@
     if (panel.categories) Object.assign(y, { type: "category", title: undefined, tickfont: { size: 10, color: css("--ink") }, ticklabelposition: small ? "inside" : "outside" });
     const place_colour = (p) => p.stop ? css("--ink") : soft;
     return {
-      // the margins are the same in all plots, so that one moment stands in one column
-      height: panel.categories ? 70 + 26 * panel.traces.length : small ? 260 : 320, margin: { l: small ? 46 : 120, r: 14, t: small ? 8 : 26, b: 40 }, modebar: { bgcolor: "rgba(0,0,0,0)", color: soft, activecolor: css("--accent") }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+      // the margins are the same in all plots, so that one moment stands in one column; the tools have a row of their own above
+      height: panel.categories ? 76 + 26 * panel.traces.length : small ? 290 : 326, margin: { l: small ? 46 : 120, r: 14, t: small ? 38 : 32, b: 40 }, modebar: { bgcolor: "rgba(0,0,0,0)", color: soft, activecolor: css("--accent") }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
       font: { color: css("--ink"), size: small ? 10 : 12, family: "system-ui, DejaVu Sans, sans-serif" }, hovermode: "closest", hoverdistance: -1,
       hoverlabel: { bgcolor: css("--paper"), bordercolor: grid, font: { color: css("--ink") }, align: "left" },
       showlegend: false, xaxis: { ...axis, title: { text: data.clock ? "time [h:min]" : "time [s]", standoff: 4 }, range: range.slice(), ...(data.clock ? ticks(range) : {}) }, yaxis: y, dragmode: small ? false : "zoom",
       shapes: [...bounds.filter((b) => !b.far).map((b) => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: b.value, y1: b.value, line: { color: b.dash === "dot" ? css("--ink") : css("--bad"), width: 1.2, dash: b.dash } })),
         ...places.map((p) => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: p.value, y1: p.value, layer: "below", line: { color: place_colour(p), width: p.stop ? 1 : 0.8, dash: p.stop ? "solid" : "dot" } }))],
       annotations: [...bounds.map((b) => ({ xref: "paper", x: 1, xanchor: "right", showarrow: false, ...(b.far ? { yref: "paper", y: b.far > 0 ? 1 : 0, yanchor: b.far > 0 ? "top" : "bottom" } : { y: panel.log ? Math.log10(b.value) : b.value, yanchor: "bottom" }), text: `${b.far ? (b.far > 0 ? "↑ " : "↓ ") : ""}${b.name} ${+b.value.toPrecision(4)}`, font: { size: 10, color: b.dash === "dot" ? css("--ink") : css("--bad") } })),
-        ...places.map((p) => ({ xref: "paper", x: 0, xanchor: "left", y: p.value, yanchor: "bottom", showarrow: false, text: p.stop ? `<b>${safe(p.name)}</b>` : safe(p.name), font: { size: 10, color: place_colour(p) } }))],
+        ...named(panel).map((p) => ({ xref: "paper", x: 0, xanchor: "left", y: p.value, yanchor: p.below ? "top" : "bottom", showarrow: false, text: p.stop ? `<b>${safe(p.name)}</b>` : safe(p.name), font: { size: 10, color: place_colour(p) } }))],
     };
   }
   const safe = (text) => text.replace(/&/g, "&amp;").replace(/</g, "&lt;");
@@ -93,7 +127,11 @@
     box.className = "plot"; box.id = "plot-" + panel.id; box.tabIndex = 0; box.setAttribute("role", "group"); box.setAttribute("aria-label", panel.title + ", " + panel.unit);
     box.style.marginLeft = box.style.marginRight = 0;
     const head = document.createElement("figcaption"), title = document.createElement("h3"), note = document.createElement("span");
-    title.textContent = panel.title + (panel.unit ? `, ${panel.unit}` : ""); note.className = "about"; note.textContent = panel.note || "";
+    title.textContent = panel.title;
+    if (panel.unit) { // where there is no room for it at the axis
+      const unit = document.createElement("span"); unit.className = "unit"; unit.textContent = `, ${panel.unit}`; title.append(unit);
+    }
+    note.className = "about"; note.textContent = panel.note || "";
     head.append(title, note);
     const draw = document.createElement("div"); draw.className = "draw";
     const cursor = document.createElement("div"); cursor.className = "cursor";
@@ -189,8 +227,12 @@
   const position = floats(film.position || none), lateral = floats(film.lateral || none), speed = floats(film.speed || none), links = bytes(film.links);
   const map = film.map ? film.map.map(floats) : null, edges_of = film.edge ? floats(film.edge) : null;
   const canvas = at("view"), pen = canvas.getContext("2d"), slider = at("slider");
+  function flatness([east, north]) { // how far a net goes from south to north, over how far from west to east
+    const span = (values) => { let low = Infinity, high = -Infinity; for (const v of values) { if (v < low) low = v; if (v > high) high = v; } return high - low; };
+    return span(north) / Math.max(span(east), 1);
+  }
   let frame = 0, now = whole[0], playing = false, last = 0;
-  const height = map ? 460 : 72 + 46 * Math.max(film.tracks.length, 1);
+  const height = map ? Math.round(Math.min(460, Math.max(180, 120 + 8000 * flatness(map)))) : 72 + 46 * Math.max(film.tracks.length, 1);
   slider.max = times.length - 1;
   film.trains.forEach((train, k) => at("follow").add(new Option("train " + train.name, k)));
 
@@ -211,23 +253,30 @@
   }
 
   // words are left out where they would lie on others
-  let taken = [];
+  let taken = [], brink = 0; // what is written, and where the picture begins
   function write(text, x, y) {
     const width = pen.measureText(text).width, edge = canvas.clientWidth - 4;
     if (pen.textAlign === "left" && x < edge) x = Math.min(x, edge - width);
     const left = x - (pen.textAlign === "center" ? width / 2 : 0);
-    if (taken.some(([l, r, at]) => left < r + 3 && left + width > l - 3 && Math.abs(at - y) < 12)) return false;
-    taken.push([left, left + width, y]); pen.fillText(text, x, y);
+    if (left < brink || taken.some(([l, r, at]) => left < r + 3 && left + width > l - 3 && Math.abs(at - y) < 12)) return false;
+    taken.push([left, left + width, y]);
+    pen.save(); pen.setLineDash([]); pen.lineJoin = "round"; pen.lineWidth = 3; pen.strokeStyle = css("--panel"); pen.strokeText(text, x, y); pen.restore(); // a rim, so that lines do not cross it
+    pen.fillText(text, x, y);
     return true;
   }
+  // of a crowd these trains have numbers: the first and the last by place, and about ten between them
+  const numbers_of = (here) => {
+    const order = here.map((p, k) => k).filter((k) => here[k]).sort((a, b) => here[b].x - here[a].x), stride = Math.ceil(order.length / 12);
+    return new Set(count <= 30 ? order : order.filter((_, i) => i % stride === 0 || i === order.length - 1));
+  };
 
   // a net of any shape: true to scale, unless it is so long and flat that nothing could be told apart
   const box = map ? [0, 1].map((d) => { let low = Infinity, high = -Infinity; for (const v of map[d]) { if (v < low) low = v; if (v > high) high = v; } return [low, high]; }) : null;
   function paint_map(share, width) {
-    const here = film.trains.map((_, k) => place(k, share)), chosen = +at("follow").value, zoom = Math.pow(2, +at("zoom").value);
+    const here = film.trains.map((_, k) => place(k, share)), numbered = numbers_of(here), chosen = +at("follow").value, zoom = Math.pow(2, +at("zoom").value);
     const spans = box.map(([low, high]) => Math.max(high - low, 100)), margin = 60;
     const across = (width - 2 * margin) / spans[0], up = (height - 2 * margin) / spans[1];
-    const base = Math.min(across, up), raised = Math.min(up, 8 * across) > base * 1.5 ? Math.min(up, 8 * across) / base : 1;
+    const base = Math.min(across, up), raised = spans[1] > 100 && Math.min(up, 8 * across) > base * 1.5 ? Math.min(up, 8 * across) / base : 1;
     const sx = zoom * base, sy = zoom * base * raised;
     const mid = chosen >= 0 && here[chosen] ? [here[chosen].x, here[chosen].side] : box.map(([low, high]) => (low + high) / 2);
     const px = (x) => width / 2 + sx * (x - mid[0]), py = (y) => height / 2 - sy * (y - mid[1]);
@@ -257,8 +306,8 @@
       const x = px(p.x), y = py(p.side);
       pen.fillStyle = shown(film.trains[k].color); pen.strokeStyle = css("--panel"); pen.lineWidth = 1.5;
       pen.beginPath(); pen.arc(x, y, 7, 0, 7); pen.fill(); pen.stroke();
-      if (count <= 30 || zoom > 4) {
-        pen.fillStyle = css("--ink"); pen.font = "bold 12px system-ui, DejaVu Sans, sans-serif"; pen.textAlign = "left"; write(film.trains[k].name, x + 9, y + (k % 2 ? 14 : -12));
+      if (zoom > 4 || numbered.has(k)) {
+        pen.fillStyle = css("--ink"); pen.font = "bold 12px system-ui, DejaVu Sans, sans-serif"; pen.textAlign = "left"; [k % 2 ? 14 : -12, k % 2 ? -12 : 14].some((d) => write(film.trains[k].name, x + 9, y + d));
       }
     });
     pen.font = "12px system-ui, DejaVu Sans, sans-serif"; // stops are named where the trains leave room
@@ -311,10 +360,10 @@
     }
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.clearRect(0, 0, width, height);
-    taken = [];
+    taken = []; brink = 0;
     if (map) { paint_map(share, width); return; }
     const here = film.trains.map((_, k) => place(k, share));
-    const present = here.filter((p) => p);
+    const present = here.filter((p) => p), numbered = numbers_of(here);
     if (!present.length) return;
     const chosen = +at("follow").value;
     const xs = present.map((p) => p.x);
@@ -330,9 +379,11 @@
     pen.textAlign = "center"; pen.lineWidth = 1;
     for (let x = Math.ceil((centre - span / 2) / step) * step; x < centre + span / 2; x += step) {
       pen.strokeStyle = line; pen.beginPath(); pen.moveTo(px(x), 34); pen.lineTo(px(x), height - 26); pen.stroke();
-      pen.fillStyle = soft; pen.fillText(+(x / 1000).toFixed(3) + " km", px(x), height - 13);
+      const words = +(x / 1000).toFixed(3) + " km";
+      if (px(x) + pen.measureText(words).width / 2 < width - 4) { pen.fillStyle = soft; pen.fillText(words, px(x), height - 13); }
     }
-    pen.save(); pen.beginPath(); pen.rect(left - 8, 0, width, height); pen.clip();
+    brink = left - 8;
+    pen.save(); pen.beginPath(); pen.rect(left - 8, 0, width - 12 - (left - 8), height); pen.clip();
     pen.strokeStyle = css("--track"); pen.lineWidth = 2;
     film.tracks.forEach((_, k) => { pen.beginPath(); pen.moveTo(left, py(k)); pen.lineTo(width - 12, py(k)); pen.stroke(); });
     for (const [a, b, from, to] of film.crossovers) {
@@ -340,7 +391,7 @@
       pen.beginPath(); pen.moveTo(px(a), py(from)); pen.lineTo(px(b), py(to)); pen.stroke();
     }
 
-    // links: arcs above the trains; heads of arrows where only one of both hears
+    // links: arcs above the trains; heads of arrows where only one of the two receives
     const mutual = new Map();
     for (let c = 0; c < couples; c++) if (links[frame * couples + c]) mutual.set(film.pairs[c].join(), links[frame * couples + c]);
     for (const [key, state] of mutual) {
@@ -348,8 +399,8 @@
       if (back && sender > receiver) continue;
       const a = here[sender], b = here[receiver];
       if (!a || !b) continue;
-      const heard = state === 2 && (!back || back === 2);
-      pen.strokeStyle = accent; pen.fillStyle = accent; pen.lineWidth = heard ? 1.8 : 1.2; pen.setLineDash(heard ? [] : [4, 4]);
+      const received = state === 2 && (!back || back === 2);
+      pen.strokeStyle = accent; pen.fillStyle = accent; pen.lineWidth = received ? 1.8 : 1.2; pen.setLineDash(received ? [] : [4, 4]);
       const ax = px(a.x), bx = px(b.x), ay = py(a.side) - 9, by = py(b.side) - 9;
       const lift = Math.min(ay, by) - Math.min(34, 8 + Math.abs(ax - bx) / 9);
       pen.beginPath(); pen.moveTo(ax, ay); pen.quadraticCurveTo((ax + bx) / 2, lift, bx, by); pen.stroke(); pen.setLineDash([]);
@@ -367,8 +418,8 @@
       pen.fillStyle = shown(train.color); pen.strokeStyle = css("--panel"); pen.lineWidth = 1.5;
       pen.beginPath(); pen.roundRect(x - length, y - 6, length, 12, 3); pen.fill(); pen.stroke();
       pen.beginPath(); pen.arc(x, y, 7, 0, 7); pen.fill(); pen.stroke();
-      if (count <= 30 || +at("zoom").value > 2) {
-        pen.fillStyle = ink; pen.font = "bold 13px system-ui, DejaVu Sans, sans-serif"; pen.textAlign = "left"; write(train.name, x + 10, y - 9);
+      if (+at("zoom").value > 2 || numbered.has(k)) {
+        pen.fillStyle = ink; pen.font = "bold 13px system-ui, DejaVu Sans, sans-serif"; pen.textAlign = "left"; [[10, -9], [-8 - pen.measureText(train.name).width, -9], [-3, -17], [10, 15]].some(([dx, dy]) => write(train.name, x + dx, y + dy));
         pen.font = "11px system-ui, DejaVu Sans, sans-serif"; pen.fillStyle = soft; pen.textAlign = "center"; if (!narrow()) write((data.per_mps * p.v).toFixed(1) + " " + data.speed_unit, x, y + 16);
       }
     });
@@ -386,7 +437,7 @@
       const row = document.createElement("tr"), head = document.createElement("th"), swatch = document.createElement("i");
       row.dataset.train = film.trains[k].name; head.scope = "row"; swatch.dataset.color = film.trains[k].color; swatch.className = "swatch";
       head.append(swatch, film.trains[k].name); row.append(head);
-      const cells = ["on", "at", "speed", "hears", "lost"].map((name) => { const cell = document.createElement("td"); cell.className = name === "at" || name === "speed" ? "n" : ""; row.append(cell); return cell; });
+      const cells = ["on", "at", "speed", "received", "lost"].map((name) => { const cell = document.createElement("td"); cell.className = name === "at" || name === "speed" ? "n" : name === "on" ? "" : "names"; row.append(cell); return cell; });
       if (map) cells[1].hidden = true;
       at("rows").append(row); rows.set(k, cells);
     });
@@ -394,18 +445,18 @@
     at("speed-unit").textContent = data.speed_unit;
   }
   const put = (cell, text) => { if (cell.textContent !== text) cell.textContent = text; };
-  function tell() {
-    const hears = film.trains.map(() => []), lost = film.trains.map(() => []);
+  function state_rows() {
+    const from = film.trains.map(() => []), lost = film.trains.map(() => []);
     for (let c = 0; c < couples; c++) {
       const state = links[frame * couples + c], [a, b] = film.pairs[c];
-      if (state) (state === 2 ? hears : lost)[b].push(film.trains[a].name);
+      if (state) (state === 2 ? from : lost)[b].push(film.trains[a].name);
     }
-    for (const [k, [on, km, fast, heard, silent]] of rows) {
+    for (const [k, [on, km, fast, received, missing]] of rows) {
       const p = place(k, 0);
-      put(on, !p ? "not there" : map ? film.tracks[edges_of[frame * count + k]] : Number.isInteger(p.side) ? "track " + film.tracks[p.side] : "crossover to track " + film.tracks[p.side > nearest(k) ? Math.ceil(p.side) : Math.floor(p.side)]);
+      put(on, !p ? "not on the net" : map ? film.tracks[edges_of[frame * count + k]] : Number.isInteger(p.side) ? "track " + film.tracks[p.side] : "crossover to track " + film.tracks[p.side > nearest(k) ? Math.ceil(p.side) : Math.floor(p.side)]);
       put(km, p && !map ? (p.x / 1000).toFixed(3) : "");
       put(fast, p ? (data.per_mps * p.v).toFixed(2) : "");
-      put(heard, hears[k].sort(natural).join(", ")); put(silent, lost[k].sort(natural).join(", "));
+      put(received, from[k].sort(natural).join(", ")); put(missing, lost[k].sort(natural).join(", "));
     }
     const happened = film.events.filter((e) => Math.abs(e.time - times[frame]) < 1e-6).map((e) => e.kind + (e.text ? " (" + e.text + ")" : ""));
     at("now").textContent = happened.length ? "Now: " + happened.slice(0, 6).join("; ") : "";
@@ -419,7 +470,7 @@
     if (!filmed) { cursors(); return; }
     frame = Math.max(0, Math.min(times.length - 1, wanted)); now = times[frame];
     slider.value = frame; slider.setAttribute("aria-valuetext", when(now)); at("clock").textContent = when(now); at("moment").href = "#t=" + +now.toFixed(3);
-    paint(0); tell(); cursors();
+    paint(0); state_rows(); cursors();
   }
   function frame_of(time) { // the last one not after ``time``
     let low = 0, high = times.length - 1;
@@ -439,7 +490,7 @@
     const gap = times[Math.min(frame + 1, times.length - 1)] - times[frame];
     paint(gap > 0 ? Math.max(0, (now - times[frame]) / gap) : 0);
     slider.value = frame; at("clock").textContent = data.clock ? when(now) : now.toFixed(1) + " s";
-    if (frame !== before) { tell(); cursors(); }
+    if (frame !== before) { state_rows(); cursors(); }
     requestAnimationFrame(tick);
   }
   function pause() { playing = false; at("play").textContent = "Play"; at("play").setAttribute("aria-pressed", "false"); }
