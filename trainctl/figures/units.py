@@ -17,6 +17,8 @@ from trainctl.signals import Floats, leader_over
 
 #: Stretch of time of a magnified panel [s].
 ZOOM_S = 60.0
+#: Points of a fault that is drawn as the scenario states it are so far apart [s].
+FAULT_S = 0.1
 
 
 def couplers(drawn: Drawn) -> Figure:
@@ -118,20 +120,27 @@ def estimates(quantity: str, label: str) -> Callable[[Drawn], Figure]:
         time = drawn.units.column("time_s")
         true, guess = drawn.units.column(truth), drawn.units.column(estimate)
         name, rows = drawn.units.slices()[0]
+        exact = _stated_fault(drawn, name, time[rows], true[rows]) if quantity == "fault" else None
+        x, y = (time[rows], true[rows]) if exact is None else exact
         options: dict[str, Any] = {"color": style.COLOURS[1], "linestyle": (0, (4, 1.5)), "label": f"estimate, unit {name}"}
-        for panel in axes[:2]:
-            style.draw(panel, time[rows], true[rows], color=style.COLOURS[0], linewidth=1.6, label=f"truth, unit {name}")
+        begin = _worst_after_start(time[rows], guess[rows] - true[rows]) - ZOOM_S / 3
+        near = (x >= begin) & (x <= begin + ZOOM_S)
+        for panel, some in ((axes[0], np.ones(len(x), bool)), (axes[1], near)):
+            style.draw(panel, x[some], y[some], color=style.COLOURS[0], linewidth=1.6, label=f"truth, unit {name}")
             style.draw(panel, time[rows], guess[rows], **options)
             panel.set_ylabel(label)
-        begin = _worst_after_start(time[rows], guess[rows] - true[rows]) - ZOOM_S / 3
         inside = (time[rows] >= begin) & (time[rows] <= begin + ZOOM_S)
-        both = np.concatenate([true[rows][inside], guess[rows][inside]])
+        both = np.concatenate([y[near], guess[rows][inside]])
         axes[1].set_xlim(begin, begin + ZOOM_S)
         if np.isfinite(both).any():
             spare = 0.1 * float(np.ptp(both[np.isfinite(both)])) + 1e-9
             axes[1].set_ylim(np.nanmin(both) - spare, np.nanmax(both) + spare)
-        axes[1].plot(time[rows], true[rows], ".", color=style.COLOURS[0], markersize=3, label="_rows")  # lines between are straight
-        axes[1].set_title("where that estimate is worst after the start; points are rows of the log", loc="right", fontsize=7)
+        for value, colour in ((true, style.COLOURS[0]), (guess, style.COLOURS[1])):
+            axes[1].plot(time[rows], value[rows], ".", color=colour, markersize=3, label="_rows")
+        straight = "lines between them are straight" if exact is None else "the truth between them is what the scenario states"
+        axes[1].set_title(
+            f"where that estimate is worst after the start; points are rows of the log, {straight}", loc="right", fontsize=7
+        )
         _bands(axes[2], drawn, guess - true, guess - true, guess - true)
         axes[2].set_ylabel("error [" + label.partition("[")[2])
         style.focus(axes[2], time, guess - true, guess - true)
@@ -140,6 +149,34 @@ def estimates(quantity: str, label: str) -> Callable[[Drawn], Figure]:
 
     figure_of.__doc__ = f"True {quantity} and its estimate of one unit; error of the estimate of all units."
     return figure_of
+
+
+def _stated_fault(drawn: Drawn, name: str, time: Floats, recorded: Floats) -> tuple[Floats, Floats] | None:
+    """Rate of a unit's force per mass [m/s3] as the faults of the scenario state it, every ``FAULT_S``.
+
+    Rows of every second are too far apart for a sinusoid of 6 s. None where the unit has no such fault, or its log says otherwise.
+    """
+    train, _, unit = name.rpartition(".")
+    stated = drawn.run.scenario.get("fault", ()) if drawn.known.trains else ()
+    faults = [f for f in stated if (str(f["train"]), str(f["unit"])) == (train, unit) and f["kind"] != "effectiveness"]
+    mass = drawn.known.mass_kg.get(train, ())
+    if not faults or not unit.isdigit() or int(unit) > len(mass):
+        return None
+
+    def rate(at: Floats) -> Floats:
+        total: Floats = np.zeros(len(at))
+        for f in faults:
+            on = (at >= f.get("start_s", 0.0)) & (at < f.get("end_s", np.inf))
+            phase = f.get("omega_rad_per_s", 0.0) * at + f.get("phase_rad", 0.0)
+            total += np.where(on, f["amplitude_n_per_s"] * np.cos(phase), 0.0) / mass[int(unit) - 1]
+        return total
+
+    some = np.isfinite(recorded)
+    if not some.any() or not np.allclose(rate(time[some]), recorded[some], rtol=1e-6, atol=1e-6):
+        return None
+    time = time[some]
+    at = np.union1d(np.arange(time[0], time[-1], FAULT_S), time)
+    return at, rate(at)
 
 
 def _worst_after_start(time: Floats, error: Floats) -> float:

@@ -239,6 +239,27 @@ def test_of_many_trains_the_figures_of_units_name_a_few(tmp_path: Path) -> None:
     assert np.diff(sorted(text.xy[1] for text in named)).min() > 0.9 * style.line_share(panel)
 
 
+FAULT = {
+    "train": 1, "unit": 1, "kind": "sinusoid", "amplitude_n_per_s": 2e5, "omega_rad_per_s": 1.0, "phase_rad": 2.0, "start_s": 500.0,
+}  # fmt: skip
+
+
+def test_a_fault_of_6_s_is_drawn_as_a_sinusoid_between_the_rows_of_every_second(finished: Callable[..., Run]) -> None:
+    """Rows alone miss its height; the truth is what the scenario states, and goes through every row."""
+    run = finished("fault_tolerant", "numeric", **{"run.duration_s": 520, "fault": [FAULT]})
+    name = next(name for name in applicable(drawable(run)) if name.endswith("fault_estimates"))
+    above, magnified, _ = figure(run, name).axes
+    assert "what the scenario states" in magnified.get_title("right")
+    unit = run.units[run.units.train.astype(str).eq("1") & run.units.unit.astype(str).eq("1")].dropna(subset="fault_mps3")
+    for panel, step in ((above, 1.0), (magnified, 0.11)):
+        (line,) = [line for line in panel.lines if str(line.get_label()).startswith("truth")]
+        x, y = line.get_data()
+        there = x >= 500.0
+        assert y[there] == pytest.approx(2.5 * np.cos(x[there] + 2.0), abs=1e-6)
+        assert y.max() > 2.499 and np.diff(x[there]).max() < step + 1e-9
+    assert np.interp(unit.time_s, x, y)[-20:] == pytest.approx(unit.fault_mps3.to_numpy()[-20:], abs=1e-6)
+
+
 def test_every_numbered_figure_exists() -> None:
     papers = [shipped(name) for name in ("fully_distributed", "robust_constrained", "emu_finite_time", "fault_tolerant")]
     assert all(law.FIGURES and law.FIGURES.keys() <= FIGURES.keys() for law in papers)
