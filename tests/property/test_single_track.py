@@ -16,9 +16,12 @@ def test_everybody_gets_out(seed):
     played(at_random(seed), seed)
 
 
-@pytest.mark.parametrize("seed", [5159, 8009, 9181, 10019])
+@pytest.mark.parametrize("seed", [2003, 5159, 8009, 9181, 9434, 10019])
 def test_trains_that_ask_far_ahead_get_out_too(seed):
-    """Turns behind one that was due where it passed; let in before others that stood ahead; two that came kept each other out."""
+    """Turns behind one that was due where it passed; let in before others that stood ahead; two that came kept each other out.
+
+    2003, 9434: a turn far ahead was taken by a train behind one that had yet to come to the same join, over another track.
+    """
     played(at_random(seed), seed, 1200.0)
 
 

@@ -3,9 +3,11 @@
 Every train runs on by itself until it *stands*: before the first stretch ahead that it has not been granted, before a join where it
 is another's turn, or behind a train that stands ahead of it; or it leaves the net. Trains that stand before one stretch stand
 behind each other. Train i *needs* train j if j may stand where i still has to pass: ahead of it on its way, on the twin of an edge
-of it, or across; or if j goes before it, at its turn or where both stand. A state is *safe* if no train needs, directly or through
-others, itself. A stretch is granted, and a train let into the net, only if it does not need itself afterwards. None is granted
-while another train may stand ahead on the way there: that would find the turns beyond taken by one that cannot come by.
+of it, or across; or if j goes before it, at its turn or where both stand. Turns count wherever i comes to that join, be it far away
+or behind a stretch it has no leave for: who has its turn by now passes first, since i takes one later. A state is *safe* if no
+train needs, directly or through others, itself. A stretch is granted, and a train let into the net, only if it does not need
+itself afterwards. None is granted while another train may stand ahead on the way there: that would find the turns beyond taken by
+one that cannot come by.
 
 A train that turns stands at the end of its way, and needs besides those that may stand where it runs back: on its next leg, on the
 twin of that or across, but for those ahead of it that it turns its rear to.
@@ -56,6 +58,7 @@ class Standing(NamedTuple):
     near: Bools  # (E,) edges on which, on whose twins or across which trains stand
     before: Mapping[int, Sequence[int]]  # train: those that go before it where it stands
     back: Mapping[int, Sequence[int]]  # train that turns: the edges it runs over then
+    goes_before: Before
 
 
 def standing(
@@ -122,6 +125,7 @@ def standing(
     for i, k, others in turns:
         if others:
             before.setdefault(i, []).extend(others)
+        if others and (limits[i] < 0 or k <= limits[i]):
             stands(i, float(ways.begin[k]), k, float(length[i]))
     known, fresh = set[tuple[int, int]](), True
     train, rows = _to_pass(ways, row, limits)
@@ -133,7 +137,7 @@ def standing(
             place = heappop(places)
             i, k = int(train[place]), int(rows[place])
             for j, m, rear in tuple(on[int(edges[place])]):
-                if j != i and (i, j) not in known and i not in before.get(j, ()) and goes_before(j, m, i, k):
+                if j != i and (i, j) not in known and goes_before(j, m, i, k):
                     known.add((i, j))
                     fresh = True
                     new = stands(i, float(ways.begin[k] + max(rear - ways.begin[m], 0.0) - clearance), k, float(length[i]))
@@ -142,7 +146,7 @@ def standing(
                             heappush(places, place + 1 + more)
     near = stood | (net.twin >= 0) & stood[net.twin]
     near[np.repeat(np.arange(len(stood)), np.diff(net.cross_first))[stood[net.cross]]] = True
-    return Standing(ways, net, row, s - length, on, near, before, back)
+    return Standing(ways, net, row, s - length, on, near, before, back, goes_before)
 
 
 def _to_pass(ways: Ways, row: Ints, limits: Mapping[int, int]) -> tuple[Ints, Ints]:
@@ -163,29 +167,29 @@ def rears(here: Standing) -> dict[int, float]:
     return found
 
 
-def needs(here: Standing, i: int, goes_before: Before) -> Iterable[int]:
+def needs(here: Standing, i: int) -> Iterable[int]:
     """Trains that must have gone before ``i`` can leave."""
     ways, row = here.ways, int(here.row[i])
     yield from here.before.get(i, ())
     for k in (row + np.flatnonzero(here.near[ways.edge[row : ways.first[i + 1]]])).tolist():  # few are, of long ways
         yield from against(here, i, k)
         for j, m, _ in here.on.get(int(ways.edge[k]), ()):
-            if j != i and i not in here.before.get(j, ()) and goes_before(j, m, i, k):
+            if j != i and here.goes_before(j, m, i, k):
                 yield j
     if i in here.back:
-        yield from _behind(here, i, goes_before)
+        yield from _behind(here, i)
 
 
-def ahead(here: Standing, i: int, k: int, goes_before: Before) -> int:
+def ahead(here: Standing, i: int, k: int) -> int:
     """A train that may stand ahead of ``i`` before row k of its way; -1: none."""
     for r in range(int(here.row[i]), k):
         for j, m, _ in here.on.get(int(here.ways.edge[r]), ()):
-            if j != i and i not in here.before.get(j, ()) and goes_before(j, m, i, r):
+            if j != i and here.goes_before(j, m, i, r):
                 return j
     return -1
 
 
-def _behind(here: Standing, i: int, goes_before: Before) -> Iterable[int]:
+def _behind(here: Standing, i: int) -> Iterable[int]:
     """Trains that must have gone before ``i`` can run back once it has turned."""
     net, ways = here.net, here.ways
     rows = {int(ways.edge[k]): k for k in range(int(ways.first[i]), int(ways.first[i + 1]))}
@@ -193,7 +197,7 @@ def _behind(here: Standing, i: int, goes_before: Before) -> Iterable[int]:
         yield from (j for j, _, _ in here.on.get(e, ()) if j != i)
         for f in (int(net.twin[e]), *net.cross[net.cross_first[e] : net.cross_first[e + 1]].tolist()):
             for j, m, _ in here.on.get(f, ()):
-                if j != i and not (rows.get(f, -1) >= here.row[i] and goes_before(j, m, i, rows[f])):
+                if j != i and not (rows.get(f, -1) >= here.row[i] and here.goes_before(j, m, i, rows[f])):
                     yield j
 
 
@@ -212,15 +216,15 @@ def goes_away(rear: float, other: float, length: float) -> bool:
     return rear + other >= length
 
 
-def in_a_circle(here: Standing, i: int, goes_before: Before) -> int:
+def in_a_circle(here: Standing, i: int) -> int:
     """A train through which ``i`` needs itself, the first on the circle; -1: it does not."""
     begun: dict[int, int] = {}  # train: by which need of ``i`` it was found
-    rest = [(j, j) for j in needs(here, i, goes_before)]
+    rest = [(j, j) for j in needs(here, i)]
     while rest:
         j, by = rest.pop()
         if j == i:
             return by
         if j not in begun:
             begun[j] = by
-            rest += [(k, by) for k in needs(here, j, goes_before)]
+            rest += [(k, by) for k in needs(here, j)]
     return -1

@@ -13,18 +13,15 @@ later trains may overtake it; this is the only exception to first come, first se
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, TypedDict
 
 import numpy as np
 
-from trainctl.railway import deadlock
+from trainctl.railway import deadlock, outlook
 from trainctl.railway.along import Order
 from trainctl.railway.zones import Index, Ordered, Trains, Zones, coming, in_place_of, near
 from trainctl.signals import Bools, Floats, Ints
-
-#: A train this near to its own stop is at it [m].
-AT_M = 1e-3
 
 
 class State(TypedDict):
@@ -203,9 +200,9 @@ def request(
                 blocker = later if later >= 0 else waiting.blocker(i, rest)
             if blocker >= 0 and later < 0:
                 if here is None or not there[i]:
-                    here = _standing(trains, there, granted, i, (), clearance, queues, joins, ordered, back)
-                stuck_itself = any(True for _ in deadlock.needs(here, blocker, trains.before(queues)))
-                if not (stuck_itself or _stood_on(here, zones.ends, i, [k, *rest])):
+                    here = outlook.standing(trains, there, granted, i, (), clearance, queues, joins, ordered, back)
+                stuck_itself = any(True for _ in deadlock.needs(here, blocker))
+                if not (stuck_itself or outlook.stood_on(here, zones.ends, i, [k, *rest])):
                     waiting.add(i, [k, *rest])
                 here = here if there[i] else None
             if blocker < 0 and outside[i]:  # no train comes in before one that waits for the same, whatever for
@@ -213,9 +210,8 @@ def request(
             if blocker < 0 and i in shut and rest and shut[i][0] <= zones.ends[rest[-1]]:
                 blocker = shut[i][1]
             if blocker < 0:
-                with_it = _standing(trains, there, granted, i, [k, *rest], clearance, queues, joins, ordered, back)
-                before = trains.before(queues)
-                blocker = max(deadlock.ahead(with_it, i, k, before), deadlock.in_a_circle(with_it, i, before), key=lambda j: j >= 0)
+                with_it = outlook.standing(trains, there, granted, i, [k, *rest], clearance, queues, joins, ordered, back)
+                blocker = max(deadlock.ahead(with_it, i, k), deadlock.in_a_circle(with_it, i), key=lambda j: j >= 0)
         if blocker >= 0:
             stuck.add(i, [k, *rest])
             behind.setdefault(e, i)
@@ -237,21 +233,21 @@ def request(
             until[i] = max(until[i], begin[r])
             _lead(leading, zones, i, r)
         # With it go the turns up to its end, at once: who is let in next comes after it.
-        turns = {(i, int(edge[r])): r for r in _joining(trains, i, k, int(zones.ends[rest[-1] if rest else k]))}
+        turns = {(i, int(edge[r])): r for r in outlook.joining(trains, i, k, int(zones.ends[rest[-1] if rest else k]))}
         joins |= turns
         said += _turns(trains, queues, joins, turns, outside)
     for i in np.flatnonzero(outside & (room > 0.0)).tolist():  # perhaps to stand before what it has not
         blocker = in_place.get(i, -1)
         if blocker < 0:
-            here = _standing(trains, there, granted, i, (), clearance, queues, joins, ordered, back)
-            blocker = deadlock.in_a_circle(here, i, trains.before(queues))
+            here = outlook.standing(trains, there, granted, i, (), clearance, queues, joins, ordered, back)
+            blocker = deadlock.in_a_circle(here, i)
         if blocker >= 0:
             room[i], zone[i], by[i] = 0.0, edge[row[i]], blocker
         there[i] = blocker < 0  # the next are judged without it
     for (i, e), k in stretches.items():
         if granted[i, e]:
             until[i] = max(until[i], begin[zones.ends[k]])
-            for r in _joining(trains, i, k, int(zones.ends[k])):
+            for r in outlook.joining(trains, i, k, int(zones.ends[k])):
                 joins.setdefault((i, int(edge[r])), r)
     for i, (k, first) in shut.items():
         if begin[k] - s[i] < min(reach[i], room[i]) and (present[i] or outside[i]):
@@ -261,7 +257,7 @@ def request(
     said += _turns(trains, queues, joins, _open(_inside(joins, barred), stretches, granted), outside)
     _keep_places(trains, queues, joins, outside, outside if keeps is None else keeps, room, zone, by)
     for i in np.flatnonzero(nearing).tolist():  # not requested: it stands before
-        k = _limit(trains, granted, i)
+        k = outlook.limit(trains, granted, i)
         if k >= 0 and (i, int(edge[k])) not in granted and begin[k] - s[i] < min(reach[i], room[i]):
             room[i], zone[i], by[i] = max(begin[k] - s[i], 0.0), edge[k], -1
     now = State(
@@ -280,12 +276,12 @@ def _until(
     until: Floats = np.where(stands, s, s + reach)
     if stop is None:
         stop = np.full(len(s), np.inf)
-    for i in np.flatnonzero((stop > s - AT_M) & (stop < until)).tolist():
+    for i in np.flatnonzero((stop > s - outlook.AT_M) & (stop < until)).tolist():
         k = int(row[i])  # of the first stretch that begins at the stop or beyond
-        while k < zones.ways.first[i + 1] and (begins[k] != k or begin[k] < stop[i] - AT_M):
+        while k < zones.ways.first[i + 1] and (begins[k] != k or begin[k] < stop[i] - outlook.AT_M):
             k += 1
         if k == zones.ways.first[i + 1] or begin[k] - stop[i] >= clearance:
-            until[i] = max(stop[i] - AT_M, s[i])
+            until[i] = max(stop[i] - outlook.AT_M, s[i])
     for train, position in state["until"].items():
         until[int(train)] = max(until[int(train)], position)
     return until
@@ -312,8 +308,9 @@ def _gives_back(
     without = {key: g and not (key[0] == i and key[1] in ahead) for key, g in granted.items()}
     if without == granted:
         return True
-    here = _standing(trains, present, without, i, (), clearance, queues, joins, ordered, back)
-    return deadlock.in_a_circle(here, i, trains.before(queues)) < 0
+    others = {e: [j for j in queue if j != i or e not in ahead] for e, queue in queues.items()}
+    here = outlook.standing(trains, present, without, i, (), clearance, others, joins, ordered, back)
+    return deadlock.in_a_circle(here, i) < 0
 
 
 def _inside(joins: dict[tuple[int, int], int], without: Bools) -> dict[tuple[int, int], int]:
@@ -339,64 +336,6 @@ def _keep_places(
                     room[i], zone[i], by[i] = away, e, before[0]
 
 
-def _limit(trains: Trains, granted: dict[tuple[int, int], bool], i: int, more: Container[tuple[int, int]] = ()) -> int:
-    """First row that a train has not been granted; -1: all is. The stretch its front is in it has, as a fact."""
-    edge, following = trains.zones.ways.edge, trains.zones.following
-    k = int(following[trains.row[i]])
-    while k >= 0 and (granted.get((i, int(edge[k])), False) or (i, int(edge[k])) in more):
-        k = int(following[k])
-    return k
-
-
-def _standing(
-    trains: Trains, on: Bools, granted: dict[tuple[int, int], bool], i: int, rows: Sequence[int], clearance: float,
-    queues: dict[int, list[int]], joins: dict[tuple[int, int], int], ordered: Sequence[Ordered],
-    back: Mapping[int, Sequence[int]],
-) -> deadlock.Standing:  # fmt: skip
-    """Where all may come to stand if ``i`` gets the stretches at these rows."""
-    zones, begin, edge = trains.zones, trains.zones.ways.begin, trains.zones.ways.edge
-    more = {(i, int(edge[k])) for k in rows}
-    known = {i, *np.flatnonzero(on).tolist()}
-    following = dict(zip(known, zones.following[trains.row[list(known)]].tolist(), strict=True))
-    limits = {j: k if k < 0 else _limit(trains, granted, j, more) for j, k in following.items()}
-    turns = [
-        (j, joins[j, e], [m for m in queue[:place] if m in limits and trains.track(m, joins[m, e]) != trains.track(j, joins[j, e])])
-        for e, queue in queues.items()
-        for place, j in enumerate(queue)
-        if j in limits and begin[joins[j, e]] > trains.s[j]
-    ]
-    new = [r for r in _joining(trains, i, rows[0], int(zones.ends[rows[-1]])) if (i, int(edge[r])) not in joins] if rows else []
-    turns += [(i, r, [m for m in queues.get(int(edge[r]), ()) if m in limits]) for r in new]  # it would come last
-
-    def stands(orders: Sequence[Ordered]) -> deadlock.Standing:
-        # Who waits before a place in a stretch does not enter that.
-        more = [(j, b if (b := int(zones.begins[k])) > trains.row[j] else k, [first]) for j, k, first, _ in orders]
-        return deadlock.standing(
-            zones.ways, zones.net, trains.row, trains.s, trains.length, clearance, limits, [*turns, *more], trains.before(queues),
-            back,
-        )  # fmt: skip
-
-    orders = [one for one in ordered if one.train in limits]
-    here = stands(orders)
-    if not orders:
-        return here
-    rear = deadlock.rears(here)  # who comes to a stand beyond the place only has passed it by then
-    left = [o for o in orders if o.first not in limits or rear.get(o.first, np.inf) + trains.length[o.first] <= begin[o.at] + AT_M]
-    return here if len(left) == len(orders) else stands(left)
-
-
-def _joining(trains: Trains, i: int, k: int, last: int) -> list[int]:
-    """Rows of joins from row k to ``last`` that the rear of ``i`` has not left."""
-    ways, joins = trains.zones.ways, trains.zones.net.joins
-    rear = trains.s[i] - trains.length[i]
-    return [r for r in range(max(k, int(ways.first[i]) + 1), last + 1) if joins[ways.edge[r]] and ways.begin[r] > rear]
-
-
-def _stood_on(here: deadlock.Standing, ends: Ints, i: int, rows: Iterable[int]) -> bool:
-    """Whether another may come to stand where it shuts the stretches at these rows to ``i``: they do not clear by themselves."""
-    return any(True for k in rows for r in range(k, ends[k] + 1) for _ in deadlock.against(here, i, r))
-
-
 def _open(
     joins: dict[tuple[int, int], int], stretches: dict[tuple[int, int], int], granted: dict[tuple[int, int], bool]
 ) -> dict[tuple[int, int], int]:
@@ -412,15 +351,14 @@ def _turns(
     trains: Trains, queues: dict[int, list[int]], near: dict[tuple[int, int], int], new: dict[tuple[int, int], int],
     outside: Bools,
 ) -> list[Decision]:  # fmt: skip
-    """Put new trains into the queues at joins: last, unless they stand before another from the same track."""
+    """Put new trains into the queues at joins."""
     said = []
     # Who is to enter comes after those that perhaps could not wait for it any more.
     for (i, e), k in sorted(new.items(), key=lambda item: (outside[item[0][0]], trains.distance(item[0][0], item[1]), item[0])):
         queue = queues.setdefault(e, [])
         if i in queue:
             continue
-        same = (t for t, j in enumerate(queue) if trains.track(j, near[j, e]) == trains.track(i, k))
-        turn = next((t for t in same if trains.goes_before(i, k, queue[t], near[queue[t], e], queues)), len(queue))
+        turn = outlook.turn_in(trains, queue, near, i, k, queues)
         queue.insert(turn, i)
         others = [j for j in queue[:turn] if trains.track(j, near[j, e]) != trains.track(i, k)]
         said.append(Decision(i, e, not others, others[-1] if others else -1, True))

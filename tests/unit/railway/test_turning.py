@@ -106,12 +106,12 @@ def test_a_train_that_turns_needs_who_may_stand_behind_it():
     back = {i: [STUB.number["T"], STUB.number["A"]] for i in (0, 1)}
     net = along.net(STUB)
     stays = deadlock.standing(ways, net, row, s, length, 10.0, {0: -1, 1: int(ways.first[1]) + 1}, (), before, back)
-    assert list(deadlock.needs(stays, 0, before)) == [] and 0 in set(deadlock.needs(stays, 1, before))
-    assert deadlock.in_a_circle(stays, 1, before) == -1
+    assert list(deadlock.needs(stays, 0)) == [] and 0 in set(deadlock.needs(stays, 1))
+    assert deadlock.in_a_circle(stays, 1) == -1
     enters = deadlock.standing(ways, net, row, s, length, 10.0, {0: -1, 1: -1}, (), before, back)
-    assert set(deadlock.needs(enters, 0, before)) == {1} and deadlock.in_a_circle(enters, 1, before) == 0
+    assert set(deadlock.needs(enters, 0)) == {1} and deadlock.in_a_circle(enters, 1) == 0
     leaves = deadlock.standing(ways, net, row, s, length, 10.0, {0: -1, 1: -1}, (), before)  # at the end of their ways
-    assert deadlock.in_a_circle(leaves, 1, before) == -1
+    assert deadlock.in_a_circle(leaves, 1) == -1
 
 
 def test_track_that_trains_turn_back_over_is_exclusive():
