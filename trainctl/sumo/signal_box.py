@@ -6,7 +6,7 @@ driver wants is overruled all the same. SUMO lets no train in before the block i
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -39,6 +39,7 @@ class Obeyed(NamedTuple):
     handed: Handed
     driven: Bools  # (n,) trains that SUMO drives
     signals: tuple[tuple[str, int], ...]  # program and link of every signal, by its number
+    alone: tuple[tuple[int, ...], ...]  # what ``alone_on`` says of every signal
     braking: Floats  # (n,) m/s2, what trains of ours brake with
     rails: Rails
     legs: tuple[tuple[tuple[str, ...], ...], ...]  # routes in parts, see ``Roster``
@@ -66,7 +67,36 @@ def obeyed(p: Model) -> Obeyed | None:
         return None
     signals = tuple((one.name, one.link) for one in p.roster.signals)
     rate = np.minimum(p.driver_rules.service_mps2, p.relied_on_by_driver.braking)
-    return Obeyed(handed, p.roster.driven, signals, rate, p.rails, p.roster.legs)
+    index = p.rails.index
+    at = [(index.get(one.edge, -1), index.get(one.onward, -1)) for one in p.roster.signals]
+    alone = tuple(alone_on(p.rails, edge, set(at)) if edge >= 0 else () for edge, _ in at)
+    return Obeyed(handed, p.roster.driven, signals, alone, rate, p.rails, p.roster.legs)
+
+
+def alone_on(rails: Rails, edge: int, signals: Collection[tuple[int, int]]) -> tuple[int, ...]:
+    """Edges from ``edge``, which ends at a signal, up to the next signal, if whoever comes there has passed the one at ``edge``.
+
+    () where there is a switch, a crossing or a track for both directions. ``signals`` are pairs of edges with a signal between.
+    """
+    found = [edge]
+    while True:
+        here = found[-1]
+        if rails.twin[here] >= 0 or rails.crossing[here]:
+            return ()
+        ends = [(here, onward) in signals for onward in _normal_after(rails, here)] if here != edge else [False]
+        if not rails.after[here] or all(ends):
+            return tuple(found)
+        if len(rails.after[here]) > 1 or len(rails.before[rails.after[here][0]]) > 1 or rails.after[here][0] in found:
+            return ()
+        found.append(rails.after[here][0])
+
+
+def _normal_after(rails: Rails, edge: int) -> Iterator[int]:
+    """Edges behind one, past those on the junction between."""
+    for onward in rails.after[edge]:
+        while rails.internal[onward]:
+            onward = rails.after[onward][0]
+        yield onward
 
 
 def write(obeyed: Obeyed, folder: Path) -> dict[str, str]:
@@ -102,18 +132,14 @@ class Box:
         self.speed = np.full(len(session.ids), np.nan)
         self.parked: list[int] = []
         self.claims: list[list[int]] = []
+        self.contested: dict[int, bool] = {}  # by signal, as far as it was asked for
         self.held: dict[tuple[int, int], set[tuple[str, str]]] = {}  # for each claim: signal and trip of those it holds
 
     def green(self, signals: Ints) -> Bools:
         """Whether signals show green, by their numbers."""
-        shown: dict[str, str] = {}
-        found = np.zeros(len(signals), bool)
-        for k, signal in enumerate(signals.tolist()):
-            name, link = self.obeyed.signals[signal]
-            if name not in shown:
-                shown[name] = self.state(name)
-            found[k] = shown[name][link] in "Gg"
-        return found
+        asked = [self.obeyed.signals[signal] for signal in signals.tolist()]
+        shown = {name: self.state(name) for name in dict.fromkeys(name for name, _ in asked)}
+        return np.array([shown[name][link] in "Gg" for name, link in asked], bool)
 
     def blocker(self, signal: int) -> int:
         """A train because of which a signal is red, -1 if SUMO names none."""
@@ -130,7 +156,7 @@ class Box:
 
         It is told to let a train pass first that does not exist, so it waits until the constraint is taken off.
         """
-        lights, claims = self.session.api.trafficlight, {(i, q) for i, q in self.claims}
+        lights, claims = self.session.api.trafficlight, {(i, q) for i, q in self.claims if self._contested(q)}
         for claim in self.held.keys() - claims:
             for at, trip in sorted(self.held.pop(claim)):
                 lights.removeConstraints(at, trip, self.obeyed.signals[claim[1]][0], NOBODY)
@@ -145,6 +171,14 @@ class Box:
                     if (at, trip) not in held:
                         held.add((at, trip))
                         lights.addConstraint(at, trip, name, NOBODY, 0, 1)
+
+    def _contested(self, signal: int) -> bool:
+        """Whether another train could be given what this signal gives: to ask SUMO takes longer than all the rest of a step."""
+        if (known := self.contested.get(signal)) is None:
+            edges, lanes = self.obeyed.alone[signal], self.session.api.edge.getLaneNumber
+            known = not edges or any(lanes(self.obeyed.rails.edges[e]) > 1 for e in edges)
+            self.contested[signal] = known
+        return known
 
     def kept_parked(self) -> list[int]:
         """Trains that were to come back with the last move, and are parked still."""
