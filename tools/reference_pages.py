@@ -48,7 +48,7 @@ def page() -> Iterator[str]:
     yield "`stops.parquet`, where trains stop: a row per train and stop, when it leaves, or at the end of the run if it did not."
     yield "\n| column | unit | meaning |"
     yield "| --- | --- | --- |"
-    yield "| `train`, `stop`, `platform` | text | Train; place with a name, else its edge; edge on which it stands. |"
+    yield "| `train`, `stop`, `platform` | text | Train; place with a name, else its edge; edge on which it stops. |"
     for name, (_, unit, text) in columns.STOPS.items():
         yield f"| `{name}` | {unit} | {text} |"
     yield "\n## Metrics\n"

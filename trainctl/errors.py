@@ -52,7 +52,7 @@ class InputError(TrainctlError):
 
 
 class SimulatorError(TrainctlError):
-    """SUMO stopped, or refused what it was told."""
+    """SUMO stopped, or refused a command."""
 
 
 class CouplingError(TrainctlError):

@@ -262,9 +262,13 @@ def test_a_run_with_signals_resumes_to_the_byte(tmp_path, others):
     ("signals", "driving", "told"),
     [
         ("wsmx", {"signals": "stop"}, ["traffic.signals = stop: "]),
-        ("", {"signals": "obey"}, ["no rail signal stands before edge main for train a and 1 more", "the net has no rail signals"]),
-        ("", {"others": "sumo"}, ["traffic.others = sumo: no rail signal stands before edge main for train a and 1 more"]),
-        ("wx", {"others": "sumo"}, ["no rail signal stands before edge main for train b"]),
+        (
+            "",
+            {"signals": "obey"},
+            ["there is no rail signal before edge main for train a and 1 more", "the net has no rail signals"],
+        ),
+        ("", {"others": "sumo"}, ["traffic.others = sumo: there is no rail signal before edge main for train a and 1 more"]),
+        ("wx", {"others": "sumo"}, ["there is no rail signal before edge main for train b"]),
         ("wsmx", {"signals": "obey", "constraint": "q"}, ["railSignalConstraints q: no such rail signal"]),
         ("wsmx", {"others": "sumo", "signals": "ignore"}, ['traffic.signals = ignore: not with others = "sumo"']),
     ],
@@ -317,9 +321,7 @@ def test_no_train_is_rerouted_to_where_no_signal_would_hold_it(tmp_path, signals
     refused = [e["reason"] for e in found.events if e["kind"] == "reroute_refused"]
     rows = found.trains.astype({"train": str, "edge": str})
     assert bool((rows[rows.train == "a"].edge == "back").any()) is taken and not amiss(found)
-    assert refused == (
-        [] if taken else ["signals are obeyed, and on the path to edge back none stands before edge east for train a"]
-    )
+    assert refused == ([] if taken else ["signals are obeyed, and the path to edge back has none before edge east for train a"])
 
 
 def test_what_sumo_would_die_of_is_refused_in_its_words(tmp_path, typed):
@@ -350,7 +352,7 @@ def test_signals_are_for_sumo_alone(tmp_path, typed):
             "wx",
             ["a"],
             False,
-            "traffic.signals = ignore: chosen though not every train cooperates: no rail signal stands before edge main",
+            "traffic.signals = ignore: chosen though not every train cooperates: there is no rail signal before edge main",
         ),
         ("", ["a"], False, None),
     ],

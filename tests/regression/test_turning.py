@@ -287,7 +287,7 @@ def test_a_train_that_is_alone_needs_no_signal_before_its_own_way_back(tmp_path)
     stub(tmp_path, "d", 1)
     assert opened_in(tmp_path, "robust_constrained", 100, traffic={"signals": "obey", "cooperate": []}).obeys
     stub(tmp_path, "d", 2)
-    with pytest.raises(InputError, match=r"no rail signal stands before edge :b_.* for train t0 and 1 more"):
+    with pytest.raises(InputError, match=r"there is no rail signal before edge :b_.* for train t0 and 1 more"):
         opened_in(tmp_path, "robust_constrained", 100, traffic={"signals": "obey", "cooperate": []})
 
 

@@ -239,7 +239,7 @@ def _gains(run: Run) -> str:
 
 
 def _capacity(given: dict[str, Any], out: Path, formats: tuple[str, ...], workers: int | None, as_json: bool) -> None:
-    """Run, measure and show how much a line carries; rows that failed are told and make the exit code 3."""
+    """Run, measure and show how much a line carries; rows that failed are reported and make the exit code 3."""
     import sys
 
     from trainctl.cli.console import Progress, listing, show, show_json

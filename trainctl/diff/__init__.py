@@ -1,7 +1,7 @@
 """Comparing runs and logs: what a tolerance is, what a difference is, what a finding is.
 
-**Log.** A stream of rows with the same column names in every format (``sources``). Its time column orders the rows, its keys tell
-rows of one instant apart; the first key is the train. The rows of one train (and unit, or receiver) in time are a *curve*.
+**Log.** A stream of rows with the same column names in every format (``sources``). Its time column orders the rows, its keys
+distinguish rows of one instant; the first key is the train. The rows of one train (and unit, or receiver) in time are a *curve*.
 
 **Tolerance** (``tolerance``). How far a column may lie from the reference: in value and in time, each the widest of an absolute
 number, one relative to the value, and one relative to the range of the reference. Without a tolerance in time a value is compared

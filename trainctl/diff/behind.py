@@ -64,7 +64,7 @@ def _of_table(finding: Finding, t: TableDiff, tolerances: Tolerances) -> Iterato
 
 
 def _own(evidence: Evidence, t: TableDiff, trains: Ints) -> tuple[pa.Table, pd.DataFrame]:
-    """Kept rows of some trains, and what tells each apart: time, train, other keys, how many times it stood before."""
+    """Kept rows of some trains, and what distinguishes each: time, train, other keys, how many times it occurred before."""
     table, time, train = evidence.rows()
     mine = np.isin(train, trains)
     part = table.filter(pa.array(mine)) if len(mine) else table

@@ -402,7 +402,7 @@ def _late(todo: _Open, kept: Kept, shifts: dict[int, Shift]) -> list[Finding]:
         if found.by_s < 0 and stood(a, at, at + by) and not stood(b, at, at + by):
             cause, words = "stop", f"{who} leaves out a stop of {seconds(by)}{_at(a, at, kept)}, and is early by that"
         elif found.by_s > 0 and stood(b, at, at + by) and not stood(a, at, at + by):
-            why = f": it stands{_at(b, at, kept)}"
+            why = f": it is at a standstill{_at(b, at, kept)}"
         out.append(todo.close(cause, words + since(at) + why, [train], found.columns, True, from_s=at, by=by))
     return out
 

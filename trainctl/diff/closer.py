@@ -22,7 +22,7 @@ from trainctl.signals import Bools, Floats, Ints
 #: Columns that say where a train is, the most telling first.
 PLACES = ("position_m", "distance", "odometer", "x", "y", "pos")
 SPEEDS = ("speed_mps", "speed")
-#: A train slower than this stands [m/s].
+#: A train slower than this is at a standstill [m/s].
 STANDS = 0.1
 #: ... if it is so slow in this share of the rows.
 MOST = 0.6
@@ -52,7 +52,7 @@ class Course:
 
 @dataclass
 class Kept:
-    """The evidence of a table: courses by train and what else tells rows of one instant apart."""
+    """The evidence of a table: courses by train and what else distinguishes rows of one instant."""
 
     a: dict[int, list[Course]]
     b: dict[int, list[Course]]
@@ -242,7 +242,7 @@ def _checked(
 
 
 def stood(course: Course, begin: float, end: float) -> bool:
-    """Whether a train stands through most of a time."""
+    """Whether a train is at a standstill through most of a time."""
     speed = course.speed
     inside = (course.time >= begin) & (course.time <= end)
     return speed is not None and bool(inside.any()) and float((speed[inside] <= STANDS).mean()) >= MOST

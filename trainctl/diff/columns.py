@@ -15,7 +15,7 @@ from trainctl.signals import Bools, Floats
 
 
 def floats(column: pa.ChunkedArray) -> Floats | None:
-    """A column as numbers, NaN where nothing stands; None if it holds other texts."""
+    """A column as numbers, NaN where it is empty; None if it holds other texts."""
     if pa.types.is_null(column.type):
         return np.full(len(column), np.nan)
     try:
@@ -29,14 +29,14 @@ def floats(column: pa.ChunkedArray) -> Floats | None:
 
 
 def filled(column: pa.ChunkedArray) -> bool:
-    """Whether anything stands in a column; SUMO writes an empty text where it has nothing to say."""
+    """Whether a column has anything in it; SUMO writes an empty text where it has nothing to say."""
     if pa.types.is_string(column.type):
         return bool(pc.any(pc.not_equal(column, "")).as_py())
     return bool(column.null_count < len(column))
 
 
 def resolution(column: pa.ChunkedArray) -> float:
-    """What the last decimal of a column of texts stands for; 0 if it is unknown."""
+    """The value of the last decimal of a column of texts; 0 if it is unknown."""
     if not pa.types.is_string(column.type):
         return 0.0
     for text in column.slice(0, 64).to_pylist():
@@ -55,7 +55,7 @@ class Compared(NamedTuple):
     difference: Floats | None = None
     #: How far they may lie apart.
     allowed: Floats | None = None
-    #: What the last decimal of either stands for.
+    #: The value of the last decimal of either.
     decimal: float = 0.0
 
 

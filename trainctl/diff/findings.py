@@ -108,7 +108,7 @@ def named(trains: Iterable[str], key: str = "train") -> str:
 
 
 def short(name: str) -> str:
-    """A name, or whatever stands in a log, as a part of a line."""
+    """A name, or whatever is in a log, as a part of a line."""
     text = printable(name[: LETTERS + 1]) or '""'
     return text if len(text) <= LETTERS else f"{text[: LETTERS - 3]}..."
 

@@ -27,7 +27,7 @@ from trainctl.record.folder import INFO, beside, free, installed, ours, remove, 
 from trainctl.runs.run import Run
 from trainctl.runs.sumo_logs import kind_of, opened
 
-#: SUMO's header stands in the first bytes of a log.
+#: SUMO's header is in the first bytes of a log.
 HEADER_BYTES = 1 << 20
 
 #: Entry of run.json and golden.json: the logs that hold only some instants.

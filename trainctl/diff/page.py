@@ -174,7 +174,7 @@ def _of(t: TableDiff, column: str, train: int, report: Report) -> Curves | None:
 
 
 def _series(evidence: Evidence, train: int, column: str) -> tuple[Floats, Floats, float]:
-    """Kept values of a column of one train (of its first unit or link), their times, what their last decimal stands for."""
+    """Kept values of a column of one train (of its first unit or link), their times, the value of their last decimal."""
     table, time, trains = evidence.rows()
     if column not in table.column_names:
         return np.zeros(0), np.zeros(0), 0.0

@@ -18,7 +18,7 @@ TRAIN_ROWS = 20_000
 EVIDENCE_BYTES = 1 << 26
 
 #: Figures of a column of numbers and what they begin with. ``rows``: rows since the first difference, differing or not; ``shift_*``
-#: and ``scale_*``: the constants c and k for which b = a + c, b = k a in all of these within what the last decimals can tell.
+#: and ``scale_*``: the constants c and k for which b = a + c, b = k a in all of these within the precision of the last decimals.
 FIGURES = {
     "count": 0.0, "rows": 0.0, "sum": 0.0, "sum_abs": 0.0, "size": 0.0,
     "first_s": np.inf, "first_a": np.nan, "first_b": np.nan, "first_gap": np.nan,

@@ -22,7 +22,7 @@ SHORT = 0.06
 def platforms(drawn: Drawn) -> Figure:
     """Track occupation diagram: a row for each platform, a bar for each stop from arrival to departure, a frame for its plan.
 
-    The busiest platforms, where there are more than can be told from each other.
+    The busiest platforms, where there are more than can be distinguished.
     """
     stops = drawn.run.stops.astype({"train": str, "stop": str, "platform": str})
     found = stops.groupby(["stop", "platform"], sort=True).size()

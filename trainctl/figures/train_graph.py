@@ -35,7 +35,7 @@ def train_graph(drawn: Drawn) -> Figure:
     """Time-distance diagram with the places on the way by name and train numbers on the lines.
 
     On a line of tracks: one colour per train, one line style per track; below, relative to the reference, where trains 5 km apart
-    can be told from each other, and of many trains how far each has gained on it since the start. Where trains come and go: one
+    can be distinguished, and of many trains how far each has gained on it since the start. Where trains come and go: one
     panel per corridor, full lines for trains in formations, planned
     times dashed, and marks on the lines that say what happened.
 

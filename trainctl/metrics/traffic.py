@@ -19,7 +19,7 @@ from trainctl.runs.series import INSTANT, Series
 from trainctl.runs.sumo_logs import elements, find_log
 from trainctl.signals import Bools, Floats
 
-#: Headways in time are counted for trains faster than this [m/s]: one that stands has none.
+#: Headways in time are counted for trains faster than this [m/s]: one at standstill has none.
 MOVING_MPS = 1.0
 
 #: attribute of a tripinfo -> name of its mean
@@ -79,7 +79,7 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
 def of_trains(trains: Series, section_m: float | None, inside: Sequence[float], turned: Bools) -> Values:
     """Headways and throughput from our own log.
 
-    ``inside`` are gaps of trains that were told to overlap, below 0 [m]; ``turned`` (rows,) is that of ``runs.series.turns``.
+    ``inside`` are gaps of trains that were reported to overlap, below 0 [m]; ``turned`` (rows,) is that of ``runs.series.turns``.
     """
     if not trains.names:
         return {}

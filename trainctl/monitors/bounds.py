@@ -34,7 +34,7 @@ def _alarm(bound: str, who: str, value: float, limit: float) -> Alarm:
 
 
 class State(NamedTuple):
-    """What has been violated so far, and what that is told from; overwritten in place."""
+    """What has been violated so far, and what that is computed from; overwritten in place."""
 
     tally: Tally
     last: Floats  # (n,) m, fronts a step ago, see ``on_track``

@@ -1,4 +1,4 @@
-"""Who waits for whom: told when a wait grows long, and when trains wait for each other in a circle.
+"""Who waits for whom: reported when a wait grows long, and when trains wait for each other in a circle.
 
 A train waits if it stands, not at its own stop, or is due to enter, or to come back from where it is parked, and cannot. What it
 waits for is what forbids it to start: the train ahead, or whoever has the switch, or the block behind the signal it stands at. It
@@ -27,7 +27,7 @@ STANDS_MPS = 0.05
 #: What is waited at; ``Wait.place`` is one of them.
 TRAIN, SWITCH, SIGNAL, ENTRY, TURN, PARKED = "train", "switch", "signal", "entry", "turn", "parked"
 
-#: A circle with a signal in it is told once it has lasted so long [s]: a red that has only just come may go again by itself.
+#: A circle with a signal in it is reported once it has lasted so long [s]: a red that has only just come may go again by itself.
 LASTS_S = 60.0
 
 
@@ -144,7 +144,7 @@ def circles(found: Sequence[Wait]) -> list[list[int]]:
 
 
 class State(NamedTuple):
-    """Waits told so far; overwritten in place."""
+    """Waits reported so far; overwritten in place."""
 
     since: Floats  # (n,) s, since when every train waits, NaN: it does not
     told: Bools  # (n,) whether that has been told
@@ -152,7 +152,7 @@ class State(NamedTuple):
 
 
 class Waiting:
-    """Waits from step to step: each is told once, a long one and a circle."""
+    """Waits from step to step: each is reported once, a long one and a circle."""
 
     def __init__(self, ids: Sequence[str], edges: Sequence[str], limit_s: float) -> None:
         self.ids, self.edges, self.limit_s = ids, edges, limit_s

@@ -1,9 +1,9 @@
 """Neighbours along the ways trains take: where every train is, and which is next ahead.
 
 A train's way is the list of edges it runs over from its departure until it leaves the net. On every edge its way is compared with
-the trains that stand there (sorted by how far their fronts are past the start of the edge), on every edge where tracks join also
-with the trains that come over another track (sorted by their distance to that edge). Spacings are front to front. What stands
-bodily in the way is in ``bodies``.
+the trains that are there (sorted by how far their fronts are past the start of the edge), on every edge where tracks join also
+with the trains that come over another track (sorted by their distance to that edge). Spacings are front to front. Obstacles
+are in ``bodies``.
 
 A train that reverses begins a new way.
 """
@@ -191,8 +191,8 @@ def ahead(places: Places) -> Ahead:
     Ahead is a train whose front is on the way, also if its own way branches off later, and one that still comes over another track
     and joins: its distance to the edge where it joins is smaller (ties by number), or its turn was decided to be earlier. Its
     spacing is the difference of the distances, so it can be negative where the turn was decided against the distances. Where turns
-    are decided, only the last before the own counts, not the nearest. Two trains of which one stands on the way of the other before
-    they part and join again keep the order they stand in.
+    are decided, only the last before the own counts, not the nearest. Two trains of which one is on the way of the other before
+    they part and join again keep their order.
 
     The train behind is the inverse where it is unique, see ``behind``: two trains may have the same one ahead, on two tracks before
     a join or where one ahead of both will branch off.
@@ -294,7 +294,7 @@ def _ahead(places: Places, train: Ints, spacing: Floats) -> None:
             e = ways.edge[k]
             p = places.front[i] + 1 if k == places.row[i] else places.piece_first[e]
             while p < places.piece_first[e + 1] and (places.piece_train[p] == i or places.front[places.piece_train[p]] != p):
-                p += 1  # a tail whose front has left the edge
+                p += 1  # the rear of a train whose front has left the edge
             if p < places.piece_first[e + 1]:
                 if away + places.depth[p] <= places.horizon:
                     found, best = places.piece_train[p], away + places.depth[p]

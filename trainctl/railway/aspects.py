@@ -1,4 +1,4 @@
-"""Rail signals along the ways of trains: what stands ahead of each, who is first before it, and how far each may go.
+"""Rail signals along the ways of trains: which are ahead of each, who is first before it, and how far each may go.
 
 What a signal shows belongs to its track, not to a train: whoever follows another one sees the green of that one, and the red a step
 or two after it has passed. So green counts for the first train before a signal alone, and for that one only once it has been the
@@ -28,7 +28,7 @@ keep_by_sources()  # before anything below is decorated
 #: So many steps a signal takes to show what it means to a train that has just come to be the first before it, or to ask.
 SETTLES = 3
 
-#: A train stands this far before a signal [m].
+#: A train stops this far before a signal [m].
 STANDS_BEFORE_M = 0.5
 
 
@@ -119,9 +119,9 @@ def decide(
     green : ndarray of bool, shape (V,)
         What the signal of every row of ``seen`` shows.
     s, present, asks : ndarray, shape (n,)
-        Front of every train [m], whether it is on the net, and whether it asks for signals: not while it stands at a stop.
+        Front of every train [m], whether it is on the net, and whether it asks for signals: not while it is at a stop.
     braking, binding : ndarray, shape (n,)
-        Braking distance of every train [m]; how far from now it may have stopped at least if it is told of red one step later [m].
+        Braking distance of every train [m]; how far from now it may have stopped at least if it sees red one step later [m].
     before : State
         A step ago.
 

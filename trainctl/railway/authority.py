@@ -51,7 +51,7 @@ def look(
     limit : ndarray, shape (E,)
         Maximum speed on every edge [m/s].
     falls : ndarray of bool, shape (E,)
-        Where that is about to fall: only half the way there is told, since half the braking is left for it.
+        Where that is about to fall: only half the distance is given, since half the braking is left for it.
     factor : ndarray, shape (n,)
         Share of that which every train keeps to.
     row, s, speed, length, present : ndarray, shape (n,)
@@ -63,7 +63,7 @@ def look(
     order : Order, optional
         Turns that are decided, see ``interlocking.order``.
     internal : ndarray of bool, shape (E,)
-        Edges inside junctions: whoever keeps a join clear stands before its junction.
+        Edges inside junctions: whoever keeps a join clear stops before its junction.
     at : int
         What trains are held at: place in ``supervisor.KINDS``.
     back : ndarray of bool, shape (n,), optional
@@ -147,7 +147,7 @@ def _limits(
             while k < ways.first[i + 1] and ways.begin[k] - s[i] < horizon:
                 v, away = factor[i] * limit[ways.edge[k]], ways.begin[k] - s[i]
                 sooner = away > 0.0 and falls[ways.edge[k]]
-                if away <= 0.0 or v < last or sooner:  # one that is no lower than the one before tells nothing new
+                if away <= 0.0 or v < last or sooner:  # one that is no lower than the one before adds nothing
                     if again:
                         train[count], distance[count], speed[count] = i, 0.5 * away if sooner else away, v
                     count += 1
@@ -157,7 +157,7 @@ def _limits(
 
 
 def with_targets(targets: Targets, train: Ints, room: Floats, kind: int) -> Targets:
-    """Targets and points that stand ``room`` [m] ahead of the trains ``train``."""
+    """Targets and points that lie ``room`` [m] ahead of the trains ``train``."""
     n = len(train)
     return Targets(
         train=np.concatenate([targets.train, train]),

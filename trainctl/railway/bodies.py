@@ -1,4 +1,4 @@
-"""What stands bodily in the way of trains: bodies on their ways, the other way, across, and at joins. Room is front to body."""
+"""What obstructs trains bodily: bodies on their ways, the other way, across, and at joins. Room is front to body."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ class Bodies(NamedTuple):
 
 
 class Obstacles(NamedTuple):
-    """What stands nearest in the way of each train."""
+    """The nearest obstacle of each train."""
 
     room: Floats  # (n,) m from the front to it, negative: overlapping; inf: none
     train: Ints  # (n,) whose body it is, -1: none
-    sense: Ints  # (n,) 1: it runs the same way, -1: it comes the other way, 0: across, or a join to be kept clear
+    sense: Ints  # (n,) 1: it runs in the same direction, -1: it comes towards it, 0: across, or a join to be kept clear
 
 
 def bodies(places: Places, virtual: bool = True) -> Bodies:
-    """Find what is in the way of each train, from the nearest to what the others hide.
+    """Find the obstacles of each train, from the nearest to what the others hide.
 
-    The nearest alone does not tell how far a train may go: the tail of one that branches off is gone in a moment, and there may be
-    another behind it.
+    The nearest alone does not decide how far a train may go: the rear of one that branches off is gone in a moment, and there
+    may be another behind it.
 
     Parameters
     ----------
@@ -60,14 +60,14 @@ def bodies(places: Places, virtual: bool = True) -> Bodies:
     -----
     What is hidden. Let train j run all of the way of train i from where they meet as far as i looks. Then j hides from i what j
     must keep clear of itself: all beyond its *front*, but of those who come to a join over another track only who pass before *it*.
-    That is safe, whatever becomes of j. As long as i can brake behind j, and j before k, with D the way to a stand,
+    That is safe, whatever becomes of j. As long as i can brake behind j, and j before k, D the braking distance,
     ``d_ij >= D(v_i) - D(v_j)`` and ``d_jk >= D(v_j) - D(v_k)``; so, in the sum, i before k: ``d_ik >= D(v_i) - D(v_k)``, and
-    a length more. The same holds of a k that comes the other way or stands. So k is far enough away when it comes to sight,
+    a length more. The same holds of a k that comes towards it or has stopped. So k is far enough away when it comes to sight,
     because j leaves the net or takes another way. What j need not heed no train keeps clear of for i, so that is said: who passes
     a join after j and before i, and what lies across a track that j is over already. Of several that come the other way on one
     edge the first hides the others by the same sum: they follow it.
 
-    Bodies reach from the front back over the way they came; where a way began less than a length ago the tail lies on the edges
+    Bodies reach from the front back over the way they came; where a way began less than a length ago the rear lies on the edges
     that lead there, see ``rows.tails``. Bodies on the twin of an edge are mirrored. A body on an edge that crosses one of the way
     blocks it as a whole; a train that already is on a blocked edge is held only by trains that are deeper in. A train is no
     obstacle to itself.
@@ -88,9 +88,9 @@ def obstacles(places: Places, virtual: bool = True) -> Obstacles:
 
 
 def fouling(places: Places, back: Bools) -> Bools:
-    """Whether the tail of each train lies, or may lie, on another or across its track, behind the beginning of its way; (n,).
+    """Whether the rear of each train lies, or may lie, on another or across its track, behind the beginning of its way; (n,).
 
-    No train comes up to such a tail: its train was put there. So it is to be asked before a train is. Of trains that come ``back``
+    No train comes up to such a rear: its train was put there. So it is to be asked before a train is. Of trains that come ``back``
     (n,) from where they were parked all of the body counts, for the same reason.
     """
     found = np.zeros(len(places.row), bool)
@@ -119,7 +119,7 @@ def _first_to_join(places: Places, i: int, own: int, guard: int) -> int:
 
     Those whose turn is not after that of the approach ``guard`` do not count; -1: all do.
 
-    A decided turn counts also while one of the two stands on the way of the other: else the one that comes later would learn of it
+    A decided turn counts also while one of the two is on the way of the other: else the one that comes later would learn of it
     only where they part, which may be just before the join.
     """
     k, edge = places.join_row[own], places.ways.edge
@@ -280,12 +280,12 @@ def _in_the_way(
 
 @njit(cache=True)
 def _told(places: Places, i: int, k: int, j: int, r: int, inside: float) -> bool:
-    """Whether the piece of ``j`` at row k of the way of ``i`` goes on back over the edge before, and was told there."""
+    """Whether the piece of ``j`` at row k of the way of ``i`` goes on back over the edge before, and was counted there."""
     ways = places.ways
     e, b = ways.edge[k], ways.edge[k - 1]
     if r > ways.first[j]:
         return ways.edge[r - 1] == b and (k - 1 > places.row[i] or _deeper(places.s[j] - ways.begin[r - 1], j, inside, i))
-    if places.twin[b] == e:  # a tail is straight
+    if places.twin[b] == e:  # the rear of a train lies straight
         return False
     if k - 1 > places.row[i]:
         return True

@@ -11,7 +11,7 @@ from trainctl.signals import Bools, Floats, Ints
 
 keep_by_sources()  # before anything below is decorated
 
-#: Instead of a row, where the tail of a train lies on an edge behind the beginning of its way: it does, or it may.
+#: Instead of a row, where the rear of a train lies on an edge behind the beginning of its way: it does, or it may.
 BEHIND, PERHAPS = -1, -2
 
 
@@ -48,10 +48,10 @@ def pieces(ways: Ways, row: Ints, s: Floats, length: Floats, present: Bools) -> 
 def tails(
     ways: Ways, size: Floats, before_first: Ints, before: Ints, s: Floats, length: Floats, present: Bools
 ) -> tuple[Ints, Ints, Ints, Floats]:  # fmt: skip
-    """Find every edge a train's tail may be on behind the beginning of its way.
+    """Find every edge the rear of a train may be on behind the beginning of its way.
 
-    Where one edge leads into the first the tail lies on that one, and so on back. Where several do it is not known on
-    which it lies, and it counts on all of them: two tails more than there are cost a little time, one less a collision.
+    Where one edge leads into the first the rear lies on that one, and so on back. Where several do it is not known on
+    which it lies, and it counts on all of them: a rear too many costs a little time, one too few a collision.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
-"""Whether trains can all get out at all, whoever decides: a search over where they may stand, with a stated limit of effort.
+"""Whether trains can all get out at all, whoever decides: a search over where they may stop, with a stated limit of effort.
 
 The interlocking never lets trains into a circle, so without orders there is always a way out: one train after the other. Orders can
-forbid every one: where two trains are to meet at a siding that is shorter than they are, say. A *state* is where trains stand: not
+forbid every one: where two trains are to meet at a siding that is shorter than they are, say. A *state* is where trains are: not
 on the net yet, with the front at the end of an edge or behind another train, or gone. A *move* takes one train on to another such
-place, over track on which nobody stands, or lets it in, or out. One at a time is enough, since whatever trains do at
-once they can do in small moves, one after the other; and whoever can leave leaves, which is in nobody's way.
+place, over track on which no train is, or lets it in, or out. One at a time is enough, since whatever trains do at
+once they can do in small moves, one after the other; and whoever can leave leaves, which obstructs no other.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Case(NamedTuple):
     ways: Ways
     net: Net
     start: Floats  # (n,) m, front at entry; who enters over one edge comes in the order of the numbers
-    length: Floats  # (n,) m, room that each needs where it stands
+    length: Floats  # (n,) m, room that each needs where it stops
     orders: Sequence[tuple[int, int, int, int]]  # train, row of its way it must not enter before another one, and the row of that
 
 
@@ -110,7 +110,7 @@ def _under(case: Case, i: int, s: float) -> list[int]:
 
 
 def _stood(case: Case, state: tuple[float, ...]) -> dict[int, list[tuple[float, int]]]:
-    """Edges with those that stand on them: how far the rear of each is in [m], < 0: on the edge before; and who."""
+    """Edges with the trains on them: how far the rear of each is in [m], < 0: on the edge before; and who."""
     on: dict[int, list[tuple[float, int]]] = {}
     for i, s in enumerate(state):
         if OUT < s < GONE:
@@ -137,7 +137,7 @@ def _clear(case: Case, i: int, on: dict[int, list[tuple[float, int]]]) -> bool:
 
 
 def _places(case: Case, state: tuple[float, ...], i: int, on: dict[int, list[tuple[float, int]]]) -> list[float]:
-    """Where a train that is on the net may go to stand next [m]; just ``GONE`` if it can leave."""
+    """Where a train that is on the net may go and stop next [m]; just ``GONE`` if it can leave."""
     ways, s, found = case.ways, state[i], list[float]()
     held = {k: (j, m) for train, k, j, m in case.orders if train == i}
     row = _under(case, i, s)[0]

@@ -6,9 +6,9 @@ move with the old speed) and 1/2 where the acceleration is held over the step.
 
 Symbols
 -------
-T, theta    step [s], share of the new speed in a step's way
+T, theta    step [s], share of the new speed in a step's distance
 b, c        emergency and service deceleration [m/s2]
-D(v)        way from speed v to a stand with full braking, in steps [m]
+D(v)        distance from speed v to a standstill with full braking, in steps [m]
 v, w        speed of the train and of the one ahead or opposite; after the step v', w' [m/s]
 d           distance from the front to the point, less the margin [m]
 
@@ -21,7 +21,7 @@ no margin touched: before a fixed point ``d >= D(v)``, behind a moving train ``d
 1. Full braking for one step takes ``D(v) - D(v')``, so a safe state stays safe under it, and there always is a safe choice.
    ``verdict`` takes the maximum v' that is safe after the step for the minimum the others can do: the train ahead brakes with b,
    it cannot brake harder (``minimum``); of two opposing trains each takes half of ``d - D(v) - D(w)`` for itself at most.
-   Whatever more the train ahead does only adds, because its way and D(w') grow with w'. So a safe state stays safe, whatever
+   Whatever more the train ahead does only adds, because its distance and D(w') grow with w'. So a safe state stays safe, whatever
    is demanded.
 2. Nothing is missed on the way to the end. Behind a train ahead with v' >= w', safety says ``d' >= D(v') - D(w') >= 0``. If
    v' < w' even when the train ahead brakes fully, then v < w too, because no train brakes harder than b: the lower speed before
@@ -59,7 +59,7 @@ from trainctl.signals import Bools, Floats, Ints, Table
 KINDS = ("train", "opposing", "switch", "stop", "end", "signal", "limit")
 TRAIN, OPPOSING, SWITCH, STOP, END, SIGNAL, LIMIT = range(7)
 
-#: Farther than anything here [m]: stands for no bound in the sums.
+#: Farther than anything here [m]: means no bound in the sums.
 _FAR = 1e9
 
 #: Rounding in lengths [m] and accelerations [m/s2].
@@ -124,7 +124,7 @@ class Assumed(NamedTuple):
     surge: Floats  # m/s, >= 0: its speed may rise by this where the slope changes and its actuators follow late
     uncertainty: Floats  # m, >= 0, of its measured position
     blur: float  # m/s, of every measured speed
-    within: bool = False  # trains may stop within a step and stand for the rest of it, not at its end only
+    within: bool = False  # trains may stop within a step and remain at a standstill for the rest of it, not at its end only
 
 
 class Targets(NamedTuple):
@@ -136,7 +136,7 @@ class Targets(NamedTuple):
     train: Ints  # whose target it is
     room: Floats  # m, front to the point now, margin not subtracted; rear of the train ahead, front of an opposing one
     speed: Floats  # m/s, of the point: along the way for a train ahead, towards us for an opposing one; >= 0
-    moving: Bools  # False: the point stands; or will, as far as this train may rely on it
+    moving: Bools  # False: the point is fixed; or will be, as far as this train may rely on it
     kind: Ints  # place in KINDS
     other: Ints  # the other train, -1 if none
 
@@ -153,7 +153,7 @@ class Verdict(NamedTuple):
     """What every train may do over the coming step, shape (n,)."""
 
     maximum: Floats  # m/s2, >= minimum
-    minimum: Floats  # m/s2, full emergency braking, but not backwards: a step ends at a stand at worst
+    minimum: Floats  # m/s2, full emergency braking, but not backwards: a step ends at a standstill at worst
     emergency: Bools  # full emergency braking is ordered of a moving train
     reason: Ints  # place in KINDS of what binds, -1: nothing does
     target: Ints  # row of what binds, in Limits if the reason is "limit", otherwise in Targets; -1: none
@@ -178,7 +178,7 @@ def no_limits() -> Limits:
 
 
 def stopping_distance(speed: Floats, b: float | Floats, step: float, theta: float) -> Floats:
-    """Way [m] from ``speed`` [m/s] to a stand, braking with ``b`` [m/s2] in steps of ``step`` [s]: D of the module.
+    """Distance [m] from ``speed`` [m/s] to a standstill, braking with ``b`` [m/s2] in steps of ``step`` [s]: D of the module.
 
     With ``v = (m + f) b T``, m whole, 0 <= f < 1: ``D = b T^2 ((m + 1)(m/2 + f) - theta (m + f))``. At least ``v^2 / 2b`` for
     theta <= 1/2, equal to it for theta = 1/2 and f = 0. Shape of ``speed``.
@@ -265,7 +265,7 @@ def verdict(
     bound = np.full(n, params.greatest_mps2)
     np.minimum.at(bound, train, rates)
     reason, target = np.full(n, -1, np.int64), np.full(n, -1, np.int64)
-    binds = np.flatnonzero((rates == bound[train]) & (rates < params.greatest_mps2))[::-1]  # of equals the first row stands
+    binds = np.flatnonzero((rates == bound[train]) & (rates < params.greatest_mps2))[::-1]  # of equals the first row counts
     target[train[binds]] = np.where(binds < len(targets.train), binds, binds - len(targets.train))
     reason[train[binds]] = np.concatenate([targets.kind, np.full(len(limits.train), LIMIT)])[binds]
     emergency = (bound <= _RATE - b) & (speed > 0.0)
@@ -276,7 +276,7 @@ class _Braking(NamedTuple):
     """Braking for every target, shape (k,)."""
 
     room: Floats  # m, to the point less the margin
-    to_stop: Floats  # m, that may pass until the train stands
+    to_stop: Floats  # m, that may pass until the train is at a standstill
     speed: Floats  # m/s, from which it brakes: what the train may be as fast as
     way: Floats  # m, it takes with full braking from now on
 
@@ -374,7 +374,7 @@ def _before_limits(
     train = limits.train
     v, top = settled[train], settled[train] + (params.greatest_mps2 + relied.scatter[train]) * step
     rate = np.full(len(v), np.inf)
-    # Most rows do not bind, and are told cheaply: the limit is not below any speed to come, or farther than any braking for it.
+    # Most rows do not bind, and are found cheaply: the limit is not below any speed to come, or farther than any braking for it.
     planned = np.minimum(params.service_mps2, relied.braking)
     sooner = relied.uncertainty + settles(relied, planned) * np.maximum(speed, settled)
     far = (
@@ -410,7 +410,7 @@ def applied(verdict: Verdict, demanded: Floats) -> tuple[Floats, Bools]:
     acceleration : ndarray, shape (n,)
         Within ``minimum`` and ``maximum`` [m/s2].
     intervened : ndarray of bool, shape (n,)
-        Where that changes the motion. A brake demanded that would outlast the stand is cut at it, which is no intervention.
+        Where that changes the motion. A brake demanded that would outlast the stop is cut at it, which is no intervention.
     """
     wanted = np.where(np.isnan(demanded), -np.inf, demanded)
     intervened = (wanted > verdict.maximum + _RATE) | (wanted < verdict.strongest - _RATE) & (verdict.minimum <= verdict.strongest)

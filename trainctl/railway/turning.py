@@ -1,10 +1,10 @@
 """Where trains turn back: the legs of a route between two turns, and what of the track a train must be on to turn.
 
-A train turns where its route goes over into the other direction of the track it is on. It stands then, with all of itself on track
-that its next leg runs back over, edge by edge; its rear becomes its front, see ``ways.turned``. As in SUMO 1.28 the next leg must
-have as many normal edges as there are edges under the train, those inside junctions too, and the rear must not stand inside a
+A train turns where its route goes over into the other direction of the track it is on. It has stopped then, with all of itself on
+track that its next leg runs back over, edge by edge; its rear becomes its front, see ``ways.turned``. As in SUMO 1.28 the next leg
+must have as many normal edges as there are edges under the train, those inside junctions too, and the rear must not stand inside a
 junction: SUMO puts such a train somewhere else. It puts a train that reaches over junctions farther by their length; to make up for
-that the train is told to go on by as much before it turns, so there must be room for it.
+that the train is ordered to go on by as much before it turns, so there must be room for it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from trainctl.signals import Bools, Floats, Ints
 
-#: A train that turns stands at least this far before the end of its edge [m]; nearer than 0.1 m SUMO would let it arrive.
+#: A train that turns stops at least this far before the end of its edge [m]; nearer than 0.1 m SUMO would let it arrive.
 SHORT_M = 0.2
 
 #: Room that is left beyond what a train goes on by before it turns [m].
@@ -28,7 +28,7 @@ ROUNDING_M = 1e-6
 
 
 class Yard(NamedTuple):
-    """Where the front of a train may stand to turn, between the ends of the edges of a leg that its next leg runs back over."""
+    """Where the front of a train may stop to turn, between the ends of the edges of a leg that its next leg runs back over."""
 
     places: Floats  # (k, 2) m, from and to, as positions on the way; in order, none where it is too long to turn
 
@@ -40,7 +40,7 @@ class Yard(NamedTuple):
         return float("inf")
 
     def aim(self, front: float, braking: float, into: float) -> float:
-        """Where a train at ``front`` that would stand ``braking`` [m] farther on is to come to its stand [m].
+        """Where a train at ``front`` that could stop ``braking`` [m] farther on is to stop [m].
 
         It brakes as soon as it may turn; ``into`` [m] is how far into such track it aims at least, if there is room.
         """

@@ -81,7 +81,7 @@ def rerouted(old: Ways, train: int, row: int, edges: Sequence[int] | Ints, start
 def turned(
     old: Ways, train: int, row: int, s: float, length: float, edges: Sequence[int] | Ints, start_m: Floats, length_m: Floats
 ) -> tuple[Ways, int, float]:
-    """Ways with the one back for a train that turns where it stands.
+    """Ways with the one back for a train that turns where it is.
 
     Parameters
     ----------

@@ -134,7 +134,7 @@ class Trains(NamedTuple):
         return float(self.zones.ways.begin[k] - self.s[i])
 
     def goes_before(self, i: int, k: int, j: int, m: int, queues: dict[int, list[int]]) -> bool:
-        """Whether ``i`` comes before ``j`` to the edge at their rows k and m, by where they stand or by their turns before it."""
+        """Whether ``i`` comes before ``j`` to the edge at their rows k and m, by where they are or by their turns before it."""
         edge = self.zones.ways.edge
         nearer = (self.distance(i, k), i) < (self.distance(j, m), j)
         while k > self.row[i] and m > self.row[j]:

@@ -58,7 +58,7 @@ def model_of(
     folder : Path
         Where relative paths in it start.
     known : sequence of str
-        Mistakes found before; what is found here is told together with them.
+        Mistakes found before; what is found here is reported together with them.
     enrolled : tuple of Roster and Path, optional
         The trains of ``network.sumocfg`` and their net, where the scenario has taken them over already.
     beside : Model, optional

@@ -30,7 +30,7 @@ MOST = 5
 def chosen(
     driving: TrafficTable, together: Bools, signals: Sequence[Signal], bare: Sequence[str]
 ) -> tuple[Literal["ignore", "obey"], list[str], list[str]]:
-    """Whether signals are obeyed, what is to be told of that, and what is wrong with it.
+    """Whether signals are obeyed, what is to be reported of that, and what is wrong with it.
 
     Parameters
     ----------
@@ -54,10 +54,10 @@ def chosen(
     if driving.signals is None and not sumo and (not signals or not alone):
         return "ignore", [], []
     if driving.signals is None and not sumo and bare:
-        why = f'though not every train cooperates: no rail signal stands {bare[0]}; give it one, or say signals = "obey"'
+        why = f'though not every train cooperates: there is no rail signal {bare[0]}; give it one, or say signals = "obey"'
         return "ignore", [f"traffic.signals = ignore: chosen {why} to list all such places"], []
     of = "traffic.signals = obey" if driving.signals else "traffic.others = sumo"
-    wrongs = [f"{of}: no rail signal stands {one}: nothing would decide who goes first there" for one in bare]
+    wrongs = [f"{of}: there is no rail signal {one}: nothing would decide who goes first there" for one in bare]
     if driving.signals == "obey" and not signals:
         wrongs.append("traffic.signals = obey: the net has no rail signals")
     if driving.signals or wrongs:

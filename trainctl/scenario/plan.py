@@ -16,7 +16,7 @@ from trainctl.topology import graph
 
 
 def plan_of(scenario: Scenario) -> graph.Plan:
-    """The topology's rule as arrays; what is missing is told."""
+    """The topology's rule as arrays; what is missing is reported."""
     top, ids = scenario.topology, scenario.ids
     index = {name: i for i, name in enumerate(ids)}
     said: dict[tuple[int, int], graph.Stated] = {}

@@ -102,7 +102,7 @@ class TrafficTable(Table):
         return below
 
     cooperate: tuple[str, ...] = Field(
-        ("*",), description="Trains that join formations, by id; * stands for anything. The others drive alone."
+        ("*",), description="Trains that join formations, by id; * matches anything. The others drive alone."
     )
     others: Literal["driven", "sumo"] = Field(
         "driven",

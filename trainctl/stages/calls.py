@@ -52,7 +52,7 @@ def on_the_way(
     position, speed : ndarray, shape (n,)
         Fronts [m] and speeds [m/s].
     standing : ndarray, shape (n,)
-        Who stands at a stop.
+        Who is at a stop.
     """
     at = known.first[trains] + next_stop[trains]
     room = known.place[at] - position[trains]

@@ -36,7 +36,7 @@ class State(NamedTuple):
     slot: Floats  # m, wanted position relative to the formation's reference
     ask_at: Floats  # s, when each may ask again
     parted: Ints  # the train each was coupled to before, -1: none
-    refused: Ints  # the train the law did not let each couple to, as was told, -1: none
+    refused: Ints  # the train the law did not let each couple to, as was reported, -1: none
 
 
 class Convoys:

@@ -72,7 +72,7 @@ class Driver:
         around : Around
             What is ahead, and the stops.
         traffic : traffic.State
-            Who stands.
+            Who is at a standstill.
         formed : Formed
             The formations.
         commanded : ndarray, shape (n,)

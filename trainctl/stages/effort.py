@@ -1,4 +1,4 @@
-"""What a motion that was not ours has cost: force and work of every train, told from its speeds and its own data.
+"""What a motion that was not ours has cost: force and work of every train, computed from its speeds and its own data.
 
 The force of a step is ``m (rho a + R + g slope)`` with the acceleration a of the step, running resistance R and slope at its
 beginning, mass m and rotating mass factor rho of the ``[train_type]``. SUMO's Euler step moves a train with the speed at its end;

@@ -242,7 +242,7 @@ class Orders:
             raise Refused(f"the path to edge {event.to_edge} has {why}")
         signals = self.p.roster.signals
         if self.p.obeys and (where := mixed.without_signal(ways, i, row, new, self.p.scenario.ids, rails, signals)):
-            raise Refused(f"signals are obeyed, and on the path to edge {event.to_edge} none stands {where}")
+            raise Refused(f"signals are obeyed, and the path to edge {event.to_edge} has none {where}")
         common = next((n for n, (a, b) in enumerate(zip(new, way.tolist(), strict=False)) if a != b), min(len(new), len(way)))
         more = {"to_edge": event.to_edge, "from_edge": rails.edges[int(way[max(common - 1, 0)])], "goes_on": onward is not None}
         return tuple(rails.edges[e] for e in new), more

@@ -19,7 +19,7 @@ class Room:
         self.step_s, self.theta, self.greatest_mps2 = p.scenario.run.step_s, p.step_theta, p.supervision.greatest_mps2
 
     def under(self, i: int, speed: Floats, view: View, after: float) -> bool:
-        """Whether another would be under train ``i`` or its tail by the time it comes, ``after`` so many seconds.
+        """Whether another would be under train ``i`` or its rear by the time it comes, ``after`` so many seconds.
 
         Until then it makes no way, whatever its speed, and whoever follows it may run on.
         """

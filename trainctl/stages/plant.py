@@ -35,7 +35,7 @@ from trainctl.topology.exchange import Radio
 #: A law may move a train within a step by so much [m] per second more or less than a held acceleration would.
 WITHIN_M = 0.02
 
-#: Rounding in the way of a train that stands [m].
+#: Rounding in the position of a train at standstill [m].
 CREEP_M = 1e-9
 
 
@@ -148,7 +148,7 @@ class Units:
         self.period = top.communication_period_s
         self.gradient = _slopes(p)
         self.moving = cast(UnitPlant, p.plant)
-        true = p.consists._replace(mass=p.consists.mass * p.scenario.mass_factor())  # all others go by what is stated
+        true = p.consists._replace(mass=p.consists.mass * p.scenario.mass_factor())  # all others use what is stated
         self.plant = self.moving.constants(p.plant_params, true, self.gradient, faults=p.scenario.fault, trains=p.scenario.ids)
         self.noise_hold = p.plant.noise_hold(p.plant_params)
         self.noisy = self.noise_hold is not None

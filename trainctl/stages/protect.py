@@ -26,7 +26,7 @@ OverTheStep = Callable[[Floats, Disturbed, plant.State, bool], plant.Moved]
 
 
 class Protect:
-    """The supervisor of a run: bounds accelerations, and tells when it begins and ends to do so."""
+    """The supervisor of a run: bounds accelerations, and reports when it begins and ends to do so."""
 
     def __init__(self, p: Model, journal: Journal, disturbing: bool) -> None:
         self.p, self.rules, self.journal = p, p.supervision, journal

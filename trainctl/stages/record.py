@@ -169,7 +169,7 @@ class Record:
         return k % self.p.scenario.run.recorded_steps == 0 or k == self.p.scenario.run.steps
 
     def relinked(self, t: float, scene: Scene, formed: Formed, s: State) -> None:
-        """Take over the law's bounds on new links; tell of a formation that is in pieces."""
+        """Take over the law's bounds on new links; report a formation that is in pieces."""
         groups = graph.components(len(scene.trains), scene.links.sender, scene.links.receiver)
         for alarm in self.alarms.relinked(t, groups, formed.formation, scene, s.alarms):
             self.journal.event(t, "violation", **alarm)

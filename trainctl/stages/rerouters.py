@@ -162,7 +162,7 @@ class Rerouters:
         """Why train ``i`` is not led over ``edges`` where signals are obeyed; "": it is."""
         p = self.p
         where = mixed.without_signal(ways, i, row, edges, p.scenario.ids, p.rails, p.roster.signals) if p.obeys else ""
-        return f"signals are obeyed, and on the other way none stands {where}" if where else ""
+        return f"signals are obeyed, and the other route has none {where}" if where else ""
 
     def _shut(self, t: float, i: int, edge: str) -> set[int]:
         """Edges that are closed now to train ``i`` by the rerouters on this one."""

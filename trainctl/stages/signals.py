@@ -18,7 +18,7 @@ from trainctl.stages.record import Journal
 from trainctl.stages.traffic import State as Traffic
 from trainctl.world import SignalBox
 
-#: A train that is slower stands [m/s], and at a signal if that is no farther away [m].
+#: A train that is slower is at a standstill [m/s], and at a signal if that is no farther away [m].
 STANDS_MPS, AT_M = 0.05, 10.0
 
 #: Signals are looked at so much farther ahead than the way in which a train may have to stop [m].
@@ -29,7 +29,7 @@ class State(NamedTuple):
     """What is remembered of signals."""
 
     aspects: aspects.State
-    at: Ints  # (n,) red signal that every train stands at, as was told, -1: none
+    at: Ints  # (n,) red signal that every train is stopped at, as was reported, -1: none
 
 
 class Signals:
@@ -68,7 +68,7 @@ class Signals:
         seen, speed : Seen, ndarray, shape (n,)
             Where the trains are, and how fast [m/s].
         traffic : traffic.State
-            Who has come, and stands at a stop. Who has not may go up to the first signal on its way, once it comes.
+            Who has come, and is at a stop. Who has not may go up to the first signal on its way, once it comes.
         box : SignalBox or None
             Whoever sets the signals.
         s : State
@@ -158,7 +158,7 @@ class Signals:
                     ends.room[j], ends.zone[j], ends.by[j] = 0.0, e, i
 
     def _binding(self, speed: Floats) -> Floats:
-        """How far from here every train may come to a stand that is told to stop one step later [m], shape (n,)."""
+        """How far from here every train may stop that is ordered to one step later [m], shape (n,)."""
         rules, relied, step = self.p.supervision, self.p.assumed, self.p.scenario.run.step_s
         top = speed + (rules.greatest_mps2 + relied.scatter) * step + relied.drift + relied.surge
         top = top + relied.lag * (rules.greatest_mps2 + rules.emergency_mps2)

@@ -44,10 +44,10 @@ class State(NamedTuple):
     """What the traffic has come to, shape (n,)."""
 
     came: Bools
-    entering: Bools  # they come with the step to this instant, told when they are there
+    entering: Bools  # they come with the step to this instant, reported when they are there
     left: Bools
     next_stop: Ints  # number of it in the roster
-    stands_since: Floats  # s, while a train stands at a stop, else NaN
+    stands_since: Floats  # s, while a train is at a stop, else NaN
     stands_until: Floats  # s, the same
     late: Floats  # s, by how much a train was late where that was known last, NaN: not yet
     stopping: Bools  # for its next stop
@@ -55,7 +55,7 @@ class State(NamedTuple):
     waits_for: Ints  # train that each is held by at a switch, -1 if none
     kept_out: Ints  # train that keeps each from entering, -1 if none
     leg: Ints  # how often each has turned
-    turns_since: Floats  # s, while a train stands to turn, else NaN
+    turns_since: Floats  # s, while a train is stopped to turn, else NaN
     kept_back: Ints  # train that keeps each from turning, -1 if none
     requests: interlocking.State
 
@@ -230,7 +230,7 @@ class Traffic:
         self._take_over(ways, s)
         asking = np.zeros(len(speed), bool)
         asking[due] = True
-        stands = (s.kept_out >= 0) & (np.abs(speed[s.kept_out]) < STANDS_MPS)  # who stands may wait for it in turn
+        stands = (s.kept_out >= 0) & (np.abs(speed[s.kept_out]) < STANDS_MPS)  # one at a standstill may wait for it in turn
         if red is not None:
             s, ends = s._replace(waits_for=red.by.copy()), red
         else:
@@ -254,7 +254,7 @@ class Traffic:
                 view = self._look(ways, here._replace(present=present), speed, ends, s, reach)
             if s.parked[i]:
                 present[i] = self.room.returns(i, speed, view)
-                s.parked[i] = not present[i]  # and stands for one more step, the one in which it comes back
+                s.parked[i] = not present[i]  # and remains for one more step, the one in which it comes back
                 together = None if present[i] else together
                 continue
             v = self._entering_speed(i, ways, here, speed, view, ends, s, after)
@@ -262,7 +262,7 @@ class Traffic:
             if v is None:
                 kept_out[i] = waiting.kept_out(view, i)
                 continue
-            # Who may not come yet is in no other's way.
+            # Who may not come yet obstructs no other.
             present[i], came[i], entering[i], speed[i], together = i not in self.yields, True, True, v, None
             reach = self._reach(speed)
             come.append((i, v))

@@ -1,4 +1,4 @@
-"""Trains that turn back: where they stand for it, whether the way back is theirs, and the way they then have.
+"""Trains that turn back: where they stop for it, whether the way back is theirs, and the way they then have.
 
 A train turns once it has made all stops of its leg and all of it is on track that its next leg runs back over: at a stop there,
 else it brakes as soon as it is. The way back is asked for like an entry; while it is another train's it waits, and asks again.
@@ -28,7 +28,7 @@ INTO_M = 2.0
 Orders = Callable[[Ways, Ints], list[zones.Ordered]]
 
 
-#: How often every train has turned, since when it stands to turn [s] (NaN: it does not), which train prevents it (-1: none).
+#: How often every train has turned, since when it is stopped to turn [s] (NaN: it does not), which train prevents it (-1: none).
 Known = tuple[Ints, Floats, Ints]
 
 
@@ -99,7 +99,7 @@ class Turns:
         braking : callable
             Distance to a stand [m] of trains (k,) at speeds (k,).
         stands_mps : float
-            Slower than this a train stands.
+            Slower than this a train is at a standstill.
         """
         stand, rooms = [], []
         for i, yard in self.yards.items():
@@ -151,18 +151,18 @@ class Turns:
         self, trains: Sequence[int], ways: Ways, seen: Seen, reach: Floats, leg: Ints, standing: Bools,
         requests: interlocking.State, ordered: Orders | None,
     ) -> Asked:  # fmt: skip
-        """Ask for the ways back, one train after the other: each as if it were to enter the net where it stands.
+        """Ask for the ways back, one train after the other: each as if it were to enter the net where it is.
 
         Parameters
         ----------
         trains : sequence of int
-            Who stands for its turn.
+            Who is stopped for its turn.
         ways, seen
             Where all trains are that are on the track.
         reach : ndarray, shape (n,)
             How far ahead they request [m].
         leg, standing : ndarray, shape (n,)
-            Turns made, and who stands at a stop.
+            Turns made, and who is at a stop.
         requests : interlocking.State
             Of all trains.
         ordered : callable, optional

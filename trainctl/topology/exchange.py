@@ -111,10 +111,10 @@ def deliver(
     Messages
         ``heard`` (L, w) holds what each link brought last.
     ndarray of bool, shape (L,)
-        Which links heard now.
+        Which links received now.
     """
     rows, n = len(links.sender), len(sent)
-    known = len(messages.newest) == rows and messages.heard.shape == (rows, sent.shape[1])  # the first message tells its width
+    known = len(messages.newest) == rows and messages.heard.shape == (rows, sent.shape[1])  # the first message fixes the width
     heard = messages.heard.copy() if known else np.zeros((rows, sent.shape[1]))
     ever = messages.ever if len(messages.ever) == rows else np.zeros(rows, bool)
     newest, bad = (messages.newest.copy(), messages.bad.copy()) if known else (np.full(rows, -1), np.full(rows, UNKNOWN))
@@ -166,7 +166,7 @@ def _arrive(
 ) -> None:  # fmt: skip
     """Write into ``age`` (L,) how old the message is that each link brings now, -1: none; go on with ``newest`` and ``bad``.
 
-    ``spoke`` (D, n) tells who sent in the last D exchanges, oldest first.
+    ``spoke`` (D, n) is who sent in the last D exchanges, oldest first.
     """
     depth = len(spoke)
     for k in range(len(sender)):

@@ -193,7 +193,7 @@ def test_a_train_that_is_late_in_two_logs_is_one_finding():
     two = compare(log(trips, **how), log(slow, **how), Tolerances(), {})
     (f,) = merged([f for t in (one, two) for f in causes(t, Tolerances())])
     assert (f.cause, f.trains, f.by, f.tables) == ("late", ["p"], 7.0, ["fcd", "tripinfo"])
-    assert f.words == "train p late by 7 s from 61 s on: it stands on b"
+    assert f.words == "train p late by 7 s from 61 s on: it is at a standstill on b"
     assert f.first.place.time_s == pytest.approx(60.0, abs=1.0)
 
 
