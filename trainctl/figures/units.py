@@ -124,12 +124,13 @@ def estimates(quantity: str, label: str) -> Callable[[Drawn], Figure]:
         x, y = (time[rows], true[rows]) if exact is None else exact
         options: dict[str, Any] = {"color": style.COLOURS[1], "linestyle": (0, (4, 1.5)), "label": f"estimate, unit {name}"}
         begin = _worst_after_start(time[rows], guess[rows] - true[rows]) - ZOOM_S / 3
-        near = (x >= begin) & (x <= begin + ZOOM_S)
-        for panel, some in ((axes[0], np.ones(len(x), bool)), (axes[1], near)):
+        near, inside = ((at >= begin) & (at <= begin + ZOOM_S) for at in (x, time[rows]))
+        # of the magnified stretch alone every row is drawn: of the whole log only extremes
+        both_lines: list[tuple[Axes, Any, Any]] = [(axes[0], slice(None), slice(None)), (axes[1], near, inside)]
+        for panel, some, seen in both_lines:
             style.draw(panel, x[some], y[some], color=style.COLOURS[0], linewidth=1.6, label=f"truth, unit {name}")
-            style.draw(panel, time[rows], guess[rows], **options)
+            style.draw(panel, time[rows][seen], guess[rows][seen], **options)
             panel.set_ylabel(label)
-        inside = (time[rows] >= begin) & (time[rows] <= begin + ZOOM_S)
         both = np.concatenate([y[near], guess[rows][inside]])
         axes[1].set_xlim(begin, begin + ZOOM_S)
         if np.isfinite(both).any():
