@@ -143,7 +143,12 @@ def case(sumocfg: Path, base: Path, ran: Mapping[str, tuple[str, ...]]) -> dict[
         if end > tomllib.loads(scenario.read_text(encoding="utf-8"))["run"]["duration_s"]:  # SUMO itself is slower than thought
             longer = re.sub(r"(?m)^duration_s = \d+", f"duration_s = {math.ceil(end)}", scenario.read_text(encoding="utf-8"))
             scenario.write_text(longer, encoding="utf-8")
-        return found | {who: compared(ours(scenario, work / who, *with_), there, since) for who, with_ in ran.items()}
+        for who, with_ in ran.items():
+            here = ours(scenario, work / who, *with_)
+            if here.code in (0, 1) and len(here.arrived) < len(there.arrived):  # trains that wait for each other may need longer
+                here = ours(scenario, work / who, *with_, "--set", f"run.duration_s={math.ceil(max(END_S, end))}", "--force")
+            found[who] = compared(here, there, since)
+        return found
 
 
 def wrong(found: dict[str, Any]) -> list[str]:

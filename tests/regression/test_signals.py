@@ -365,6 +365,40 @@ def test_what_is_chosen_is_said(tmp_path, signals, cooperate, obeys, said):
     assert any(said in note for note in p.roster.notes) if said else not any("signals" in note for note in p.roster.notes)
 
 
+def bone(folder: Path, signals: str) -> None:
+    """Single track between two loops, round which two trains run twice."""
+    places = {"a": (0, 0), "b": (3000, 0), "c": (4000, 600), "d": (4000, -600), "e": (-1000, -600), "f": (-1000, 600)}
+    loops = {"bd": ("b", "d"), "dc": ("d", "c"), "cb": ("c", "b"), "af": ("a", "f"), "fe": ("f", "e"), "ea": ("e", "a")}
+    nets.net(folder, places, {**nets.both_ways("ab", "a", "b"), **loops}, signals=signals)
+    way = "dc cb -ab af fe ea ab bd"
+    nets.traffic(folder, nets.train("x", f"{way} {way}", 0) + nets.train("y", f"{way} {way}", 200))
+
+
+@pytest.mark.parametrize(
+    ("signals", "driving", "obeys", "said"),
+    [
+        ("abcdef", {}, True, "traffic.signals = obey: chosen since x and 1 more run more than once over single track"),
+        ("abcdef", {"signals": "ignore"}, False, "x and 1 more run more than once over single track or a crossing: all rounds"),
+        (
+            "",
+            {},
+            False,
+            "x and 1 more run more than once over single track or a crossing: all rounds of a train are counted at once",
+        ),
+        ("a", {}, False, "traffic.signals = ignore: chosen though 2 trains run round and round: there is no rail signal before"),
+    ],
+)
+def test_trains_that_run_round_over_single_track_obey_where_they_can(tmp_path, signals, driving, obeys, said):
+    bone(tmp_path, signals)
+    made = nets.scenario("robust_constrained", 2400, traffic={"cooperate": ["*"], **driving})
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(made))
+    p = open_scenario(str(tmp_path / "s.toml"))
+    assert p.obeys is obeys and any(said in note for note in p.roster.notes), p.roster.notes
+    if obeys:
+        found = run(p, tmp_path / "out")
+        assert sorted(at(found, "arrive")) == ["x", "y"] and not amiss(found)
+
+
 @pytest.mark.parametrize(("driving", "turns"), [({"signals": "obey"}, 2), ({"others": "sumo", "cooperate": ["w"]}, 0)])
 def test_trains_turn_back_where_signals_are_obeyed_ours_and_those_of_sumo(tmp_path, driving, turns):
     """A shuttle on a single track, and one that comes in from a branch."""

@@ -28,7 +28,7 @@ MOST = 5
 
 
 def chosen(
-    driving: TrafficTable, together: Bools, signals: Sequence[Signal], bare: Sequence[str]
+    driving: TrafficTable, together: Bools, signals: Sequence[Signal], bare: Sequence[str], again: Sequence[str] = ()
 ) -> tuple[Literal["ignore", "obey"], list[str], list[str]]:
     """Whether signals are obeyed, what is to be reported of that, and what is wrong with it.
 
@@ -42,6 +42,8 @@ def chosen(
         Rail signals of the net.
     bare : sequence of str
         Places without a signal before them, as ``unguarded`` names them.
+    again : sequence of str
+        Trains that ``laps`` names.
     """
     alone = int((~together).sum())
     sumo = driving.others == "sumo" and alone > 0
@@ -50,12 +52,14 @@ def chosen(
             'traffic.signals = ignore: not with others = "sumo": SUMO\'s trains obey them and ours would not, so that two'
             " authorities could block each other for ever"
         )
-        return "ignore", [], [wrong] if sumo else []
-    if driving.signals is None and not sumo and (not signals or not alone):
-        return "ignore", [], []
+        return "ignore", _in_turn(again), [wrong] if sumo else []
+    rounds = len(again) > 1
+    if driving.signals is None and not sumo and (not signals or not (alone or rounds)):
+        return "ignore", _in_turn(again), []
     if driving.signals is None and not sumo and bare:
-        why = f'though not every train cooperates: there is no rail signal {bare[0]}; give it one, or say signals = "obey"'
-        return "ignore", [f"traffic.signals = ignore: chosen {why} to list all such places"], []
+        though = "not every train cooperates" if alone else f"{len(again)} trains run round and round"
+        why = f'though {though}: there is no rail signal {bare[0]}; give it one, or say signals = "obey"'
+        return "ignore", [f"traffic.signals = ignore: chosen {why} to list all such places", *_in_turn(again)], []
     of = "traffic.signals = obey" if driving.signals else "traffic.others = sumo"
     wrongs = [f"{of}: there is no rail signal {one}: nothing would decide who goes first there" for one in bare]
     if driving.signals == "obey" and not signals:
@@ -63,8 +67,35 @@ def chosen(
     if driving.signals or wrongs:
         return "obey", [], wrongs
     why = f"SUMO drives {alone} of {len(together)} trains" if sumo else f"{alone} of {len(together)} trains do not cooperate"
+    if not alone:
+        why = f"{_some(again)} run more than once over single track or a crossing, which our turns let in nearly one after another"
     other = "" if sumo else '; signals = "ignore" is the other way'
     return "obey", [f"traffic.signals = obey: chosen since {why}{other}"], []
+
+
+def laps(legs: Sequence[Sequence[Ints]], ids: Sequence[str], rails: Rails) -> list[str]:
+    """Trains that come over single track or a crossing that is used both ways more than once before they turn or leave.
+
+    The rule by which trains never wait for each other in a circle (``railway.deadlock``) counts all their rounds at once.
+    """
+    used = {e for parts in legs for part in parts for e in set(part.tolist())}
+    shut = [e for e in used if any(int(f) in used for f in (rails.twin[e], *rails.crossing[e]))]
+    known: dict[bytes, bool] = {}
+    for part in (part for parts in legs for part in parts):
+        if (key := part.tobytes()) not in known:
+            there = part[np.isin(part, shut)]
+            known[key] = len(np.unique(there)) < len(there)
+    return [name for name, parts in zip(ids, legs, strict=True) if any(known[part.tobytes()] for part in parts)]
+
+
+def _in_turn(again: Sequence[str]) -> list[str]:
+    """What is to be reported of trains that ``laps`` names where our turns decide."""
+    if len(again) < 2:
+        return []
+    return [
+        f"network.sumocfg: {_some(again)} run more than once over single track or a crossing: all rounds of a train are counted at"
+        " once, so trains are let in nearly one after another; rail signals that are obeyed let more of them run"
+    ]
 
 
 def of_formations(together: Bools, options: Mapping[str, str]) -> list[str]:

@@ -257,7 +257,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
     given, told = None, list[str]()
     if not found and scenario.controller.law != "sumo":
         bare = mixed.unguarded([way_of(d.edges) for d in traffic.departures], ids, rails, traffic.signals)
-        choice, told, wrong = mixed.chosen(driving, together, traffic.signals, bare)
+        choice, told, wrong = mixed.chosen(driving, together, traffic.signals, bare, mixed.laps(edges, ids, rails))
         found += wrong
         if choice == "obey":
             scenario = scenario.model_copy(update={"traffic": driving.model_copy(update={"signals": "obey"})})
