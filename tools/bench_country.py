@@ -24,6 +24,8 @@ from typing import Any
 import bench
 import country
 
+from trainctl.cli import GARBAGE
+
 #: Of the short roster: its trains, and steps until all but the last of them have come; then so many steps are measured.
 SHORT, BEFORE, STEPS = 1200, 2680, 160
 
@@ -138,7 +140,7 @@ def table(found: list[dict[str, Any]]) -> str:
 def of_roster(folder: Path, kind: list[str]) -> None:
     """What runs in a process of its own."""
     os.environ.setdefault("TRAINCTL_THREADS", "1")
-    gc.set_threshold(50_000)  # as in the program
+    gc.set_threshold(GARBAGE)  # as in the program
     if kind:
         print(json.dumps(whole(folder)))
     else:

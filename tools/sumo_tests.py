@@ -1,4 +1,4 @@
-"""A peer's suite: every SUMO configuration of a folder under a law and as the baseline, beside plain SUMO on the same files.
+"""Another program's tests: every SUMO configuration of a folder under a law and as the baseline, beside plain SUMO on these files.
 
 ``python tools/sumo_tests.py FOLDER`` runs each ``*.sumocfg`` below FOLDER three times: by ``sumo`` as it is, by a law (the scenario
 is that of ``trainctl new scenario``) and as the baseline (``law = "sumo"`` on the files as they are). With ``--obey`` trains also
@@ -16,8 +16,9 @@ named          how many lines ``check`` has of what is not followed
 =============  ==================================================================================================================
 
 The exit code is 1 if a run ends otherwise than with 0, 1 (a bound violated) or 2 (refused in words), if there are more collisions
-than in plain SUMO, if a stop of plain SUMO is not made, or if a train that obeys does not arrive. ``--json`` prints the rows as
-JSON, ``--only WORD`` takes the configurations with it in their path, ``--jobs`` runs several at once.
+than in plain SUMO, if a stop of plain SUMO is not made, or if a train that obeys does not arrive. A run in which fewer trains
+arrive than in plain SUMO is made again, longer, and that one counts. ``--json`` prints the rows as JSON, ``--only WORD`` takes the
+configurations with it in their path, ``--jobs`` runs several at once.
 
 SUMO's own tests come with its source package (``tests/sumo/rail``), not with the wheels; its cases name their files in options, so
 give each a configuration first (``sumo ... --save-configuration run.sumocfg``).

@@ -138,8 +138,8 @@ def _opened(
     every = checkpoint_every_s
     step = p.scenario.run.step_s
     if p.obeys and (backend != "sumo" or gui is not None):
-        key = 'others = "sumo"' if p.roster.driven.any() else 'signals = "obey"'
-        raise InputError(f"traffic.{key}: SUMO sets the signals: no --backend numeric, no --gui")
+        key, way = ('others = "sumo"', "") if p.roster.driven.any() else ('signals = "obey"', '; signals = "ignore" does without')
+        raise InputError(f"traffic.{key}: SUMO sets the signals: no --backend numeric, no --gui{way}")
     if every is not None and not (every >= step and abs(every / step - round(every / step)) < 1e-6):
         raise InputError(f"--checkpoint-every {every:g}: must be a multiple of step_s = {step:g}")
     if every is not None and gui is not None:

@@ -365,13 +365,13 @@ def test_what_is_chosen_is_said(tmp_path, signals, cooperate, obeys, said):
     assert any(said in note for note in p.roster.notes) if said else not any("signals" in note for note in p.roster.notes)
 
 
-def bone(folder: Path, signals: str) -> None:
-    """Single track between two loops, round which two trains run twice."""
+def bone(folder: Path, signals: str, rounds: int = 2) -> None:
+    """Single track between two loops, round which one train runs twice, and another one so often."""
     places = {"a": (0, 0), "b": (3000, 0), "c": (4000, 600), "d": (4000, -600), "e": (-1000, -600), "f": (-1000, 600)}
     loops = {"bd": ("b", "d"), "dc": ("d", "c"), "cb": ("c", "b"), "af": ("a", "f"), "fe": ("f", "e"), "ea": ("e", "a")}
     nets.net(folder, places, {**nets.both_ways("ab", "a", "b"), **loops}, signals=signals)
     way = "dc cb -ab af fe ea ab bd"
-    nets.traffic(folder, nets.train("x", f"{way} {way}", 0) + nets.train("y", f"{way} {way}", 200))
+    nets.traffic(folder, nets.train("x", f"{way} {way}", 0) + nets.train("y", " ".join([way] * rounds), 200))
 
 
 @pytest.mark.parametrize(
@@ -385,7 +385,7 @@ def bone(folder: Path, signals: str) -> None:
             False,
             "x and 1 more run more than once over single track or a crossing: all rounds of a train are counted at once",
         ),
-        ("a", {}, False, "traffic.signals = ignore: chosen though 2 trains run round and round: there is no rail signal before"),
+        ("a", {}, False, "traffic.signals = ignore: chosen though 2 trains run several rounds: there is no rail signal before"),
     ],
 )
 def test_trains_that_run_round_over_single_track_obey_where_they_can(tmp_path, signals, driving, obeys, said):
@@ -397,6 +397,19 @@ def test_trains_that_run_round_over_single_track_obey_where_they_can(tmp_path, s
     if obeys:
         found = run(p, tmp_path / "out")
         assert sorted(at(found, "arrive")) == ["x", "y"] and not amiss(found)
+
+
+def test_one_train_that_runs_round_changes_nothing_and_who_chose_no_signals_is_told_the_way_out(tmp_path, typed):
+    bone(tmp_path / "one", "abcdef", rounds=1)
+    bone(tmp_path / "two", "abcdef")
+    for folder in ("one", "two"):
+        (tmp_path / folder / "s.toml").write_text(
+            tomli_w.dumps(nets.scenario("robust_constrained", 300, traffic={"cooperate": ["*"]}))
+        )
+    p = open_scenario(str(tmp_path / "one" / "s.toml"))
+    assert not p.obeys and not any("more than once" in note for note in p.roster.notes)
+    code, lines = typed("run", tmp_path / "two" / "s.toml", "--backend", "numeric", "--out", tmp_path / "out")
+    assert code == 2 and 'signals = "ignore" does without' in lines[-1], lines
 
 
 @pytest.mark.parametrize(("driving", "turns"), [({"signals": "obey"}, 2), ({"others": "sumo", "cooperate": ["w"]}, 0)])

@@ -147,7 +147,7 @@ class State(NamedTuple):
     """Waits reported so far; overwritten in place."""
 
     since: Floats  # (n,) s, since when every train waits, NaN: it does not
-    told: Bools  # (n,) whether that has been told
+    told: Bools  # (n,) whether that has been reported
     counted: dict[str, Any]  # circles: lists of trains; forming: since when those not told yet last [s]; long: number of long waits
 
 

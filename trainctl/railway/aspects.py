@@ -5,8 +5,8 @@ or two after it has passed. So green counts for the first train before a signal 
 first, and has asked, for ``SETTLES`` steps; all others stop before the signal.
 
 Who sets the signals may think better of a green, even while a train can stop no more. So a train claims every signal that it will
-not be able to stop before by the next step: until it has passed, nobody else gets what it needs, and nobody comes onto the track
-behind the signal. A green that was set while another came there is none yet.
+not be able to stop before by the next step: until it has passed, nobody else gets what it needs, and no train of ours comes onto
+the track behind the signal. A green that was set while another came there is none yet.
 """
 
 from __future__ import annotations
@@ -121,7 +121,8 @@ def decide(
     s, present, asks : ndarray, shape (n,)
         Front of every train [m], whether it is on the net, and whether it asks for signals: not while it is at a stop.
     braking, binding : ndarray, shape (n,)
-        Braking distance of every train [m]; how far from now it may have stopped at least if it sees red one step later [m].
+        Braking distance of every train [m]; the distance from here within which it stops for certain if it
+        sees red one step later [m].
     before : State
         A step ago.
 

@@ -4,7 +4,7 @@ Every train runs on by itself until it *stands*: before the first stretch ahead 
 is another's turn, or behind a train that stands ahead of it; or it leaves the net. Trains that stand before one stretch stand
 behind each other. Train i *needs* train j if j may stand where i still has to pass: ahead of it on its way, on the twin of an edge
 of it, or across; or if j goes before it, at its turn or where both stand. Turns count wherever i comes to that join, be it far away
-or behind a stretch it has no leave for: who has its turn by now passes first, since i takes one later. A state is *safe* if no
+or beyond a stretch it has not been granted: who has its turn by now passes first, since i takes one later. A state is *safe* if no
 train needs, directly or through others, itself. A stretch is granted, and a train let into the net, only if it does not need
 itself afterwards. None is granted while another train may stand ahead on the way there: that would find the turns beyond taken by
 one that cannot come by.
@@ -15,7 +15,7 @@ twin of that or across, but for those ahead of it that it turns its rear to.
 Orders are needs as well: who must let another train pass first needs that until it comes to a stand beyond the place only. They can
 forbid every way out, which is looked for before a run (``solvable``); what the rule then grants is free of circles all the same.
 
-Circles of joins alone, without single track or crossings, are not looked at (a roundabout that is full): those are told, see
+Circles of joins alone, without single track or crossings, are not looked at (a roundabout that is full): those are reported, see
 ``monitors.waiting``.
 
 Progress. In a safe state some train needs no other: a finite graph without a circle has a node without successors. When all stand,
@@ -56,7 +56,7 @@ class Standing(NamedTuple):
     rear: Floats  # (n,) m, of every train now
     on: Mapping[int, Sequence[tuple[int, int, float]]]  # edge: trains that stand on it, its row in their ways, and their rears [m]
     near: Bools  # (E,) edges on which, on whose twins or across which trains stand
-    before: Mapping[int, Sequence[int]]  # train: those that go before it where it stands
+    before: Mapping[int, Sequence[int]]  # train: those that go before it, where it stands or at a join ahead
     back: Mapping[int, Sequence[int]]  # train that turns: the edges it runs over then
     goes_before: Before
 
@@ -78,7 +78,8 @@ def standing(
     limits : mapping
         Of every train on the net: first row that it may not enter, -1 if there is none.
     turns : iterable
-        Train, row of a join, and the trains that have their turns there before it.
+        Train, row of a join it has yet to come to, and the trains that pass there before it. It stands before the join only if it
+        may come so far.
     goes_before : callable
         See ``Before``.
     back : mapping, optional

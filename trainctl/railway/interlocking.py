@@ -164,13 +164,13 @@ def request(
                 queues = {e: [j for j in queue if (j, e) in joins] for e, queue in queues.items()}
     order = [key for key in order if key in granted]
     new = granted.keys() - {(i, e) for i, e, _ in state["stretches"]}
-    had, waiting, stuck = Index(zones, trains), Index(zones, trains), Index(zones, trains)
+    given, waiting, stuck = Index(zones, trains), Index(zones, trains), Index(zones, trains)
     for key in order:
         if granted[key] or (s[key[0]] > begin[stretches[key]] and not outside[key[0]]):
             if not granted[key]:
                 said.append(Decision(*key, True, -1, False))
             granted[key] = True
-            had.add(key[0], [stretches[key]])
+            given.add(key[0], [stretches[key]])
     leading: dict[int, set[int]] = {}
     for key in order:
         if granted[key]:
@@ -193,9 +193,9 @@ def request(
             blocker = shut[i][1]
         elif blocker < 0:
             rest, in_front = _needed_too(trains, i, k, clearance, leading, granted, queues)
-            later = had.blocker(i, rest)
+            later = given.blocker(i, rest)
             later = in_front if later < 0 else later
-            blocker = max(had.blocker(i, [k]), waiting.blocker(i, [k]), key=lambda j: j >= 0)
+            blocker = max(given.blocker(i, [k]), waiting.blocker(i, [k]), key=lambda j: j >= 0)
             if blocker < 0:
                 blocker = later if later >= 0 else waiting.blocker(i, rest)
             if blocker >= 0 and later < 0:
@@ -221,7 +221,7 @@ def request(
                 room[i], zone[i], by[i] = max(begin[k] - s[i], 0.0), e, blocker
             continue
         there[i], here = True, None
-        had.add(i, [k, *rest])
+        given.add(i, [k, *rest])
         for r in [k, *rest]:
             one = (i, int(edge[r]))
             if one not in granted:

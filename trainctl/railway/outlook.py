@@ -60,7 +60,7 @@ def _turns_before(
 ) -> tuple[dict[int, list[int]], list[tuple[int, int, list[int]]]]:  # fmt: skip
     """The queues if ``i`` gets ``new`` turns; and who comes to their joins, its row, and those that pass before it.
 
-    Also who is far from the join, or waits for leave to come near it, passes after those that have their turns by now.
+    Also who is far from the join, or has yet to be granted the track up to it, passes after those that have their turns by now.
     """
     first, edge = trains.zones.ways.first, trains.zones.ways.edge
     rows = {(i, e): r for e, r in new.items()} | dict(joins)
@@ -68,21 +68,21 @@ def _turns_before(
     for e, r in new.items():
         queue = then.setdefault(e, [])
         if i not in queue:
-            queue.insert(turn_in(trains, queue, rows, i, r, queues), i)
+            queue.insert(turn_in(trains, queue, rows, i, r, then), i)
     if not then:
         return then, []
     queued: Bools = np.zeros(len(trains.zones.net.joins), bool)
     queued[list(then)] = True
     passed, train = np.flatnonzero(queued[edge]), np.fromiter(limits, np.int64)
-    begins, ends = np.searchsorted(passed, trains.row[train] + 1), np.searchsorted(passed, first[train + 1])
+    low, high = np.searchsorted(passed, trains.row[train] + 1), np.searchsorted(passed, first[train + 1])
     found = []
-    for j, a, b in zip(train.tolist(), begins.tolist(), ends.tolist(), strict=True):
+    for j, a, b in zip(train.tolist(), low.tolist(), high.tolist(), strict=True):
         for k in passed[a:b].tolist():
             e = int(edge[k])
             queue = then[e]
             if j in queue and rows[j, e] != k:  # round once more
                 continue
-            turn = queue.index(j) if j in queue else turn_in(trains, queue, rows, j, k, queues)
+            turn = queue.index(j) if j in queue else turn_in(trains, queue, rows, j, k, then)
             found.append((j, k, [m for m in queue[:turn] if m in limits and trains.track(m, rows[m, e]) != trains.track(j, k)]))
     return then, found
 

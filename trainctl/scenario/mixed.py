@@ -7,6 +7,7 @@ must have a signal before it.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
 from typing import Literal
@@ -57,7 +58,7 @@ def chosen(
     if driving.signals is None and not sumo and (not signals or not (alone or rounds)):
         return "ignore", _in_turn(again), []
     if driving.signals is None and not sumo and bare:
-        though = "not every train cooperates" if alone else f"{len(again)} trains run round and round"
+        though = "not every train cooperates" if alone else f"{len(again)} trains run several rounds"
         why = f'though {though}: there is no rail signal {bare[0]}; give it one, or say signals = "obey"'
         return "ignore", [f"traffic.signals = ignore: chosen {why} to list all such places", *_in_turn(again)], []
     of = "traffic.signals = obey" if driving.signals else "traffic.others = sumo"
@@ -68,24 +69,27 @@ def chosen(
         return "obey", [], wrongs
     why = f"SUMO drives {alone} of {len(together)} trains" if sumo else f"{alone} of {len(together)} trains do not cooperate"
     if not alone:
-        why = f"{_some(again)} run more than once over single track or a crossing, which our turns let in nearly one after another"
+        why = f"{_some(again)} run more than once over single track or a crossing: our own interlocking counts all rounds at once"
     other = "" if sumo else '; signals = "ignore" is the other way'
     return "obey", [f"traffic.signals = obey: chosen since {why}{other}"], []
 
 
 def laps(legs: Sequence[Sequence[Ints]], ids: Sequence[str], rails: Rails) -> list[str]:
-    """Trains that come over single track or a crossing that is used both ways more than once before they turn or leave.
+    """Trains that come more than once, before they turn or leave, over track used both ways or a crossing of used tracks.
 
-    The rule by which trains never wait for each other in a circle (``railway.deadlock``) counts all their rounds at once.
+    Only those that share such a place with another one. The rule by which trains never wait for each other in a circle
+    (``railway.deadlock``) counts all their rounds at once.
     """
     used = {e for parts in legs for part in parts for e in set(part.tolist())}
     shut = [e for e in used if any(int(f) in used for f in (rails.twin[e], *rails.crossing[e]))]
-    known: dict[bytes, bool] = {}
+    known: dict[bytes, set[int]] = {}  # edges on which a train shuts the track more than once, by its way
     for part in (part for parts in legs for part in parts):
         if (key := part.tobytes()) not in known:
-            there = part[np.isin(part, shut)]
-            known[key] = len(np.unique(there)) < len(there)
-    return [name for name, parts in zip(ids, legs, strict=True) if any(known[part.tobytes()] for part in parts)]
+            edges, times = np.unique(part[np.isin(part, shut)], return_counts=True)
+            known[key] = {f for e in edges[times > 1].tolist() for f in (e, int(rails.twin[e]), *rails.crossing[e]) if f >= 0}
+    again = [set[int]().union(*(known[part.tobytes()] for part in parts)) for parts in legs]
+    trains = Counter(e for edges in again for e in edges)
+    return [name for name, edges in zip(ids, again, strict=True) if any(trains[e] > 1 for e in edges)]
 
 
 def _in_turn(again: Sequence[str]) -> list[str]:

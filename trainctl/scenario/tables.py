@@ -111,7 +111,7 @@ class TrafficTable(Table):
     signals: Literal["ignore", "obey"] | None = Field(
         None,
         description="Rail signals of the net: obey: they decide who goes first; ignore: our own interlocking does. Default: obey"
-        " where there are some and not every train cooperates, or trains run round and round, or SUMO drives some.",
+        " where SUMO drives some trains, or where none is missing and some do not cooperate or run several rounds.",
     )
     acceleration_mps2: Positive = Field(0.4, description="Acceleration of a train or formation that is driven [m/s2].")
     deceleration_mps2: Positive = Field(0.5, description="Braking for limits, stops and trains ahead, positive [m/s2].")

@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trainctl.railway import aspects, supervisor, zones
+from trainctl.railway import along, aspects, supervisor, zones
 from trainctl.railway.interlocking import EndOfAuthority
+from trainctl.railway.rows import tails
 from trainctl.railway.ways import Ways
 from trainctl.scenario.model import Model
 from trainctl.signals import Bools, Floats, Ints, Seen
@@ -46,7 +47,7 @@ class Signals:
         self.rate = np.minimum(p.driver_rules.service_mps2, p.relied_on_by_driver.braking)
         # How far ahead of a train that enters a signal may matter.
         self.entering = supervisor.stopping_distance(p.cruise, self.rate, p.scenario.run.step_s, p.step_theta) + BEYOND_M
-        self.length = p.consists.train_length()
+        self.length, self.net = p.consists.train_length(), along.net(p.rails)
         self.ways: Ways | None = None
 
     def initial(self) -> State:
@@ -134,19 +135,21 @@ class Signals:
     def _under(self, ways: Ways, seen: Seen, trains: Bools) -> dict[int, set[int]]:
         """These trains, by the edges on which one of them shuts the track: under it, on the twins of those, and across."""
         found: dict[int, set[int]] = {}
-        rails, length = self.p.rails, self.length
+        rails, length, net = self.p.rails, self.length, self.net
+        behind = tails(ways, net.length, net.before_first, net.before, seen.position, length, trains)
+        under = list(zip(behind[0].tolist(), behind[2].tolist(), strict=True))
         for i in np.flatnonzero(trains).tolist():
-            for k in zones.under(ways, seen.row, seen.position, length, i):
-                e = int(ways.edge[k])
-                for f in (e, int(rails.twin[e]), *rails.crossing[e]):
-                    found.setdefault(f, set()).add(i)
+            under += [(i, int(ways.edge[k])) for k in zones.under(ways, seen.row, seen.position, length, i)]
+        for i, e in under:
+            for f in (e, int(rails.twin[e]), *rails.crossing[e]):
+                found.setdefault(f, set()).add(i)
         return found
 
     def _keep_clear(
         self, ways: Ways, at: Ints, seen: Seen, traffic: Traffic, sighted: aspects.Sighted, claims: list[list[int]],
         ends: EndOfAuthority,
     ) -> None:  # fmt: skip
-        """Keep trains that are not on the track off what others run onto that can stop before it no more: they would get red."""
+        """Keep trains that are not on the track off blocks that others can no longer stop before: those would get red."""
         outside = (traffic.parked | ~traffic.came) & ~self.p.roster.driven
         if not claims or not outside.any():
             return
@@ -158,7 +161,7 @@ class Signals:
                     ends.room[j], ends.zone[j], ends.by[j] = 0.0, e, i
 
     def _binding(self, speed: Floats) -> Floats:
-        """How far from here every train may stop that is ordered to one step later [m], shape (n,)."""
+        """Distance from here within which every train stops for certain if it is ordered to one step later [m], shape (n,)."""
         rules, relied, step = self.p.supervision, self.p.assumed, self.p.scenario.run.step_s
         top = speed + (rules.greatest_mps2 + relied.scatter) * step + relied.drift + relied.surge
         top = top + relied.lag * (rules.greatest_mps2 + rules.emergency_mps2)

@@ -52,10 +52,10 @@ class Yard:
         row = np.array([ways.first[i] + self.paths[i].index(e) for i, (e, _) in enumerate(self.at)])
         s = ways.begin[row] + [x for _, x in self.at]
         shared = zones.of(ways, along.net(self.net))
-        before = json.dumps(self.state)
+        old, before = self.state, json.dumps(self.state)
         arrays = (row, s, self.length, self.present)
-        self.state, ends, said = interlocking.request(shared, self.state, *arrays, self.reach, self.clearance, **more)
-        assert json.loads(json.dumps(self.state)) == json.loads(json.dumps(self.state)) and before is not None
+        self.state, ends, said = interlocking.request(shared, old, *arrays, self.reach, self.clearance, **more)
+        assert json.dumps(old) == before  # left as it was
         self.state = json.loads(json.dumps(self.state))  # as a checkpoint keeps it
         return ends, said
 
