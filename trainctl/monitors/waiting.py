@@ -75,15 +75,18 @@ def waits(
     found, none = [], np.zeros_like(speed)
     for switch in (False, True):  # a train may be kept by both, then it needs both
         parts = [authority.of(t, stand[t.train] & ((t.other < 0) == switch)) for t in (view.targets, view.clear)]
-        targets, clear = parts[0], parts[0] if view.targets is view.clear else parts[1]
-        verdict = authority.judge(rules, none, targets, clear, supervisor.no_limits(), step, theta, assumed, none)
-        others = np.concatenate([targets.other, clear.other])
-        for i in np.flatnonzero(stand & (verdict.reason >= 0) & (verdict.maximum * step < STANDS_MPS)).tolist():
+        ways = (
+            [parts[0]] if view.targets is view.clear else parts
+        )  # to follow what joins ahead, or to keep clear of it: either will do
+        verdicts = [authority.judge(rules, none, t, t, supervisor.no_limits(), step, theta, assumed, none) for t in ways]
+        kept = np.logical_and.reduce([stand & (v.reason >= 0) & (v.maximum * step < STANDS_MPS) for v in verdicts])
+        for i in np.flatnonzero(kept).tolist():
             if switch:
-                at = SIGNAL if verdict.reason[i] == supervisor.SIGNAL else SWITCH
+                at = SIGNAL if verdicts[0].reason[i] == supervisor.SIGNAL else SWITCH
                 found.append(Wait(i, int(ends.by[i]), int(ends.zone[i]), at))
-            else:
-                j = int(others[verdict.target[i]])
+            else:  # it goes once one of them does, so that counts which goes by itself
+                others = [int(t.other[v.target[i]]) for t, v in zip(ways, verdicts, strict=True)]
+                j = min(others, key=lambda other: stand[other])
                 found.append(Wait(i, j, int(here.edge[j]), TRAIN))
     return found
 

@@ -53,8 +53,8 @@ def bodies(places: Places, virtual: bool = True) -> Bodies:
     -------
     Bodies
         ``train``, ``other``, ``room`` [m], ``sense`` and ``sure`` (B,): the speed of the body along the way is ``sense`` times the
-        speed of that train, 0 for one across. Of those that come the other way on one edge, lie across it, or come to one join,
-        the nearest.
+        speed of that train, 0 for one across. Of those that come the other way on one edge, or lie across it, the nearest; of
+        those that come to one join the nearest, the nearest of those that pass after that one, and so on.
 
     Notes
     -----
@@ -134,7 +134,7 @@ def _first_to_join(places: Places, i: int, own: int, guard: int) -> int:
 
 @njit(cache=True)
 def _nearest_to_join(places: Places, i: int, own: int, guard: int) -> tuple[int, float]:
-    """Of the trains of ``_first_to_join`` the one whose rear is nearest, and how far that is [m]; -1 and inf: none.
+    """Of the trains of ``_first_to_join`` the one whose rear is nearest: its approach, and how far that is [m]; -1 and inf: none.
 
     Rears are taken to be a length behind the fronts on the way of ``i``.
     """
@@ -157,7 +157,7 @@ def _nearest_to_join(places: Places, i: int, own: int, guard: int) -> tuple[int,
         if over_another and places.rank[p] == UNDECIDED:
             over_another = comes_over_another_track(places, i, k, j, m)
         if over_another and spacing - places.length[j] < best:
-            found, best = j, spacing - places.length[j]
+            found, best = p, spacing - places.length[j]
         p -= 1
     return found, best
 
@@ -260,21 +260,23 @@ def _in_the_way(
             p += 1
     for q in range(places.own_first[i], places.own_first[i + 1]):
         own = places.own[q]
-        if virtual:
-            way = 1
-            j, value = _nearest_to_join(places, i, own, -1)
-        else:
-            j, value, way = _first_to_join(places, i, own, -1), ways.begin[places.join_row[own]] - s[i], 0
-        if j >= 0 and hides >= 0 and value > hidden:
-            guard = _approach(places, hides, places.join_row[own] + shift)
-            if virtual:
-                j, value = _nearest_to_join(places, i, own, guard)
-            else:
-                j = _first_to_join(places, i, own, guard)
-        if j >= 0 and value <= places.horizon:
+        if not virtual:  # whoever it is, the join is to be kept clear
+            value = ways.begin[places.join_row[own]] - s[i]
+            guard = _approach(places, hides, places.join_row[own] + shift) if hides >= 0 and value > hidden else -1
+            j = _first_to_join(places, i, own, guard)
+            if j >= 0 and value <= places.horizon:
+                if count < len(other):
+                    other[count], room[count], sense[count], sure[count] = j, value, 0, True
+                count += 1
+            continue
+        p, value = _nearest_to_join(places, i, own, -1)
+        if p >= 0 and hides >= 0 and value > hidden:
+            p, value = _nearest_to_join(places, i, own, _approach(places, hides, places.join_row[own] + shift))
+        while p >= 0 and value <= places.horizon:  # each hides who passes before it, not who passes between it and i
             if count < len(other):
-                other[count], room[count], sense[count], sure[count] = j, value, way, True
+                other[count], room[count], sense[count], sure[count] = places.join_train[p], value, 1, True
             count += 1
+            p, value = _nearest_to_join(places, i, own, p)
     return count
 
 

@@ -89,7 +89,7 @@ def request(
     ordered : sequence of tuple
         Trains that must leave a place to another one first.
     keeps : ndarray, shape (n,), optional
-        Of those that ask to enter, who keeps its place at joins; default all.
+        Of those that ask to enter, who keeps its place at joins and for stretches; default all.
     back : mapping, optional
         Of trains that turn at the end of their ways: the edges they run over then.
 
@@ -163,6 +163,8 @@ def request(
             if i in own[1]:
                 queues = {e: [j for j in queue if (j, e) in joins] for e, queue in queues.items()}
     order = [key for key in order if key in granted]
+    if keeps is not None:  # who has lost its place asks after all others, or who keeps it out would wait for it
+        order.sort(key=lambda key: bool(outside[key[0]] and not keeps[key[0]]))
     new = granted.keys() - {(i, e) for i, e, _ in state["stretches"]}
     given, waiting, stuck = Index(zones, trains), Index(zones, trains), Index(zones, trains)
     for key in order:
