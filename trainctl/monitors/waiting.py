@@ -75,9 +75,8 @@ def waits(
     found, none = [], np.zeros_like(speed)
     for switch in (False, True):  # a train may be kept by both, then it needs both
         parts = [authority.of(t, stand[t.train] & ((t.other < 0) == switch)) for t in (view.targets, view.clear)]
-        ways = (
-            [parts[0]] if view.targets is view.clear else parts
-        )  # to follow what joins ahead, or to keep clear of it: either will do
+        # To follow what joins ahead, or to keep clear of it: either will do.
+        ways = parts[:1] if view.targets is view.clear else parts
         verdicts = [authority.judge(rules, none, t, t, supervisor.no_limits(), step, theta, assumed, none) for t in ways]
         kept = np.logical_and.reduce([stand & (v.reason >= 0) & (v.maximum * step < STANDS_MPS) for v in verdicts])
         for i in np.flatnonzero(kept).tolist():

@@ -54,8 +54,7 @@ def chosen(
             " authorities could block each other for ever"
         )
         return "ignore", _in_turn(again), [wrong] if sumo else []
-    rounds = len(again) > 1
-    if driving.signals is None and not sumo and (not signals or not (alone or rounds)):
+    if driving.signals is None and not sumo and (not signals or not (alone or again)):
         return "ignore", _in_turn(again), []
     if driving.signals is None and not sumo and bare:
         though = "not every train cooperates" if alone else f"{len(again)} trains run several rounds"
@@ -94,7 +93,7 @@ def laps(legs: Sequence[Sequence[Ints]], ids: Sequence[str], rails: Rails) -> li
 
 def _in_turn(again: Sequence[str]) -> list[str]:
     """What is to be reported of trains that ``laps`` names where our turns decide."""
-    if len(again) < 2:
+    if not again:
         return []
     return [
         f"network.sumocfg: {_some(again)} run more than once over single track or a crossing: all rounds of a train are counted at"

@@ -92,7 +92,7 @@ class Signals:
         now, ends, told = aspects.decide(
             ways, sighted, green, seen.position, seen.present, ~traffic.standing, braking, binding, s.aspects
         )  # fmt: skip
-        self._keep_clear(ways, at, seen, traffic, sighted, now.claims, ends)
+        self._keep_clear(t, ways, at, seen, traffic, sighted, now.claims, ends)
         ids, roster = self.p.scenario.ids, self.p.roster
         for one in (one for one in told if not roster.driven[one.train]):
             name = roster.signals[one.signal].name
@@ -126,8 +126,11 @@ class Signals:
     ) -> None:  # fmt: skip
         """Take for red what was set green while another train came onto the track behind it: it will be red in a step."""
         back = traffic.standing & ~traffic.parked & (traffic.stands_until <= t + 1e-9)  # from where it was parked, perhaps
-        come = self._under(ways, seen, seen.present & (traffic.entering | back))
-        for k in np.flatnonzero(green).tolist() if come else ():
+        fresh = seen.present & (traffic.entering | back)
+        if not fresh.any():
+            return
+        come = self._under(ways, seen, fresh)
+        for k in np.flatnonzero(green).tolist():
             i, q = int(sighted.train[k]), int(sighted.signal[k])
             if [i, q] not in claims and any(come.get(e, {i}) != {i} for e in aspects.block(ways, at, int(sighted.row[k])).tolist()):
                 green[k] = False
@@ -146,11 +149,12 @@ class Signals:
         return found
 
     def _keep_clear(
-        self, ways: Ways, at: Ints, seen: Seen, traffic: Traffic, sighted: aspects.Sighted, claims: list[list[int]],
+        self, t: float, ways: Ways, at: Ints, seen: Seen, traffic: Traffic, sighted: aspects.Sighted, claims: list[list[int]],
         ends: EndOfAuthority,
     ) -> None:  # fmt: skip
         """Keep trains that are not on the track off blocks that others can no longer stop before: those would get red."""
-        outside = (traffic.parked | ~traffic.came) & ~self.p.roster.driven
+        due = self.p.roster.depart <= t + self.p.scenario.run.step_s + 1e-9
+        outside = (traffic.parked | ~traffic.came & due) & ~self.p.roster.driven
         if not claims or not outside.any():
             return
         places = self._under(ways, seen, outside)

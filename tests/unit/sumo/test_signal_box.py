@@ -12,15 +12,8 @@ from trainctl.traffic.rail_signals import rail_signals
 
 #: A line with signals at b, c and e; at d another one joins, and its last edge can be run over both ways.
 NODES = {
-    "a": (0, 0),
-    "b": (1000, 0),
-    "c": (2000, 0),
-    "x": (2500, 0),
-    "d": (3000, 0),
-    "y": (2000, 800),
-    "e": (4000, 0),
-    "f": (5000, 0),
-}
+    "a": (0, 0), "b": (1000, 0), "c": (2000, 0), "x": (2500, 0), "d": (3000, 0), "y": (2000, 800), "e": (4000, 0), "f": (5000, 0),
+}  # fmt: skip
 EDGES = {"ab": ("a", "b"), "bc": ("b", "c"), "cx": ("c", "x"), "xd": ("x", "d"), "yd": ("y", "d"), "de": ("d", "e")}
 
 
