@@ -242,8 +242,10 @@ def _driven(
     try:
         with compiling() as compiled, _stops() as stop:
             journal = Journal(partial, p, saved.values["recorder"] if saved else None)
-            for note in p.roster.notes if saved is None else ():
-                journal.event(0.0, "not_followed", what=note)
+            if saved is None:
+                for kind, lines in (("followed", p.roster.followed), ("not_followed", p.roster.notes)):
+                    for line in lines:
+                        journal.event(0.0, kind, what=line)
             if p.self_driven:
                 world = open_self_driven(p, partial)
                 simulation = Watched(p, world, journal)

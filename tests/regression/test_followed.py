@@ -161,7 +161,10 @@ def test_what_is_not_followed_is_in_the_events_and_on_the_page(folder):
     assert said["what"] == "1 x <vehicle flavour>: not followed: it is not known here"
     from trainctl.report.page import page
 
-    assert "1 x &lt;vehicle flavour&gt;: not followed" in page(found)
+    told = page(found)
+    assert "1 x &lt;vehicle flavour&gt;: not followed" in told
+    assert "<vehicle>: 1 x depart, 1 x type, 1 x departSpeed" in [e["what"] for e in events(found, "followed")]
+    assert "&lt;vehicle&gt;: 1 x depart, 1 x type, 1 x departSpeed" in told
 
 
 PARKED = '<stop lane="bc_0" endPos="1000" duration="200" parking="true"/>'

@@ -363,6 +363,7 @@ def test_what_is_chosen_is_said(tmp_path, signals, cooperate, obeys, said):
     p = open_scenario(str(tmp_path / "s.toml"))
     assert p.obeys is obeys
     assert any(said in note for note in p.roster.notes) if said else not any("signals" in note for note in p.roster.notes)
+    assert any("rail signals" in line for line in p.roster.followed) is obeys
 
 
 def bone(folder: Path, signals: str, rounds: int = 2) -> None:

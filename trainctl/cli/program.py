@@ -172,6 +172,8 @@ def check(name: ScenarioName = DEFAULT_SCENARIO, settings: Settings = None, as_j
     show(table)
     for k, line in enumerate(found.get("promise", ())):
         say(f"protection: {line}" if not k else f"  - {line}")
+    for k, line in enumerate(found["followed"]):
+        say(f"followed of SUMO's files: {line}" if not k else f"  - {line}")
     for line in found["report"]:
         say(line)
     for line in found["warnings"]:

@@ -12,7 +12,7 @@ from sumo_net import Line
 from trainctl.figures.corridors import line_of
 from trainctl.figures.trains import Drawn
 from trainctl.report.map import on_the_map
-from trainctl.report.panels import _hex, packed, told
+from trainctl.report.panels import _hex, happened, packed, told
 from trainctl.runs.series import INSTANT
 from trainctl.signals import Floats
 
@@ -96,7 +96,7 @@ def _trains(drawn: Drawn) -> list[dict[str, Any]]:
 
 
 def _events(drawn: Drawn) -> dict[str, Any]:
-    events = drawn.run.events
+    events = happened(drawn)
     return {
         "events": [{"time": event["time_s"], "kind": event["kind"], "text": told(event)} for event in events[:NAMED_EVENTS]],
         "events_left_out": max(0, len(events) - NAMED_EVENTS),

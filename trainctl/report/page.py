@@ -124,7 +124,7 @@ def page(run: Run, *, clock: bool = False, kmh: bool = False) -> str:
         "script": _template("report.js"),
         "data": _inline(data),
         "about": _about(drawn),
-        "verdict": _outcome(drawn.run) + _verdict(values, drawn.run) + _not_followed(drawn.run),
+        "verdict": _outcome(drawn.run) + _verdict(values, drawn.run) + _of_files(drawn.run),
         "bounds": _bounds(values),
         "unbounded": "" if _margins(values) else "hidden",
         "figures": _figures(values),
@@ -198,12 +198,15 @@ def _outcome(run: Run) -> str:
     )
 
 
-def _not_followed(run: Run) -> str:
-    """What the files of a SUMO configuration say and the run did not do, one line each."""
-    lines = [str(e["what"]) for e in run.events if e["kind"] == "not_followed"]
-    rows = "".join(f"<li>{escape(line)}</li>" for line in lines)
-    summary_line = f"<summary>Not followed exactly: {len(lines)} {'line' if len(lines) == 1 else 'lines'} of SUMO's files</summary>"
-    return f"<details class=left>{summary_line}<ul>{rows}</ul></details>" if lines else ""
+def _of_files(run: Run) -> str:
+    """What the files of a SUMO configuration say and the run did not do, and what it did, one line each."""
+    parts = []
+    for kind, title in (("not_followed", "Not followed exactly"), ("followed", "Followed")):
+        lines = [str(e["what"]) for e in run.events if e["kind"] == kind]
+        rows = "".join(f"<li>{escape(line)}</li>" for line in lines)
+        summary_line = f"<summary>{title}: {len(lines)} {'line' if len(lines) == 1 else 'lines'} of SUMO's files</summary>"
+        parts += [f"<details class=left>{summary_line}<ul>{rows}</ul></details>"] if lines else []
+    return "".join(parts)
 
 
 def _verdict(values: Mapping[str, Any], run: Run) -> str:

@@ -423,10 +423,15 @@ def _energy(drawn: Drawn) -> Iterator[Panel]:
     yield panel("energy", "Energy", unit, traces, note=note)
 
 
+def happened(drawn: Drawn) -> list[dict[str, Any]]:
+    """The events of a run but for what is said of SUMO's files: that stands in the summary, and happens at no moment."""
+    return [event for event in drawn.run.events if event["kind"] not in ("followed", "not_followed")]
+
+
 def _events(drawn: Drawn) -> Iterator[Panel]:
     """What happened when: one row per kind."""
     by_kind: dict[str, list[tuple[float, str]]] = {}
-    for event in drawn.run.events:
+    for event in happened(drawn):
         by_kind.setdefault(event["kind"], []).append((float(event["time_s"]), told(event)))
     most = 500
     traces = []

@@ -154,6 +154,7 @@ EVENTS: Mapping[str, Rules] = {
     },
     "waiting": {"train": _text, "other": _or_nothing(_text), "since_s": _number},
     "not_entered": {"trains": _texts},
+    "followed": {"what": _text},
     "not_followed": {"what": _text},
     "stop_reached": {"train": _text, "stop": _text},
     "waypoint": {"train": _text, "stop": _text},

@@ -33,7 +33,7 @@ MOST = 40
 
 
 def facts(p: Model) -> dict[str, Any]:
-    """Facts by name, ``warnings`` and the law's ``report`` (both lists of lines)."""
+    """Facts by name; as lists of lines what is ``followed`` of SUMO's files, ``warnings`` and the law's ``report``."""
     run, scene = p.scenario.run, p.first_scene
     links = graph.edges(scene.links, p.scenario.ids)
     found: dict[str, Any] = {
@@ -68,6 +68,7 @@ def facts(p: Model) -> dict[str, Any]:
     if p.supervision.mode != "off" and not p.self_driven:
         found["protection"] = promise.told(p)
         found["promise"] = promise.sentences(found["protection"])
+    found["followed"] = list(p.roster.followed)
     notes = [*p.roster.notes, *limits.differing(p.scenario, p.plant, p.plant_params)]
     found["warnings"] = notes + list(p.law.warnings(p.params, scene, p.start_track)) if hasattr(p.law, "warnings") else notes
     found["report"] = list(p.law.report(p.params, scene, p.scenario.disturbance)) if hasattr(p.law, "report") else []
@@ -80,7 +81,7 @@ def in_words(found: dict[str, Any]) -> list[tuple[str, str]]:
     """Name and value of every fact that is no list of lines, for people."""
     rows = []
     for key, value in found.items():
-        if key not in ("warnings", "report", "analysis", "protection", "promise"):
+        if key not in ("followed", "warnings", "report", "analysis", "protection", "promise"):
             unit = next((f" {unit}" for end, unit in UNITS.items() if key.endswith(end)), "")
             numbers = value if isinstance(value, list) else [value] if isinstance(value, float) else []
             shown = " .. ".join(f"{v:.6g}" for v in numbers) or str(value)

@@ -73,6 +73,7 @@ class Roster(NamedTuple):
     cooperates: Bools  # (n,)
     vclass: tuple[str, ...]
     patience: float  # s, who cannot enter for longer does not come; inf: all come
+    followed: tuple[str, ...]  # what of the configuration is: one line for each option, element or kind
     notes: tuple[str, ...]  # what of the configuration is not followed
     signs: tuple[tuple[float, str, float], ...]  # variable speed signs: from when on [s], edge, limit [m/s]
     closings: tuple[Closing, ...]  # edges closed for a time, round which trains are led
@@ -112,8 +113,8 @@ def placed(scenario: Scenario, line: Line, rails: Rails | None = None) -> Roster
         arrival=np.full(n, np.inf), speed=np.array([t.speed_mps for t in scenario.train], float), like=("",) * n,
         top_speed=np.full(n, np.inf), speed_factor=np.ones(n),
         legs=tuple((line.route(t.track, t.position_m),) for t in scenario.train), stops=((),) * n, cooperates=np.ones(n, bool),
-        vclass=("rail",) * n, patience=np.inf, notes=(), signs=(), closings=(), choices=(), source="", driven=np.zeros(n, bool),
-        signals=(), handed=None, placed=True, rails=Rails.of(line) if rails is None else rails,
+        vclass=("rail",) * n, patience=np.inf, followed=(), notes=(), signs=(), closings=(), choices=(), source="",
+        driven=np.zeros(n, bool), signals=(), handed=None, placed=True, rails=Rails.of(line) if rails is None else rails,
     )  # fmt: skip
 
 
@@ -137,6 +138,7 @@ def from_tables(data: Mapping[str, Any], net: Path) -> Roster:
         cooperates=np.array(data["cooperates"], bool),
         like=tuple(data["like"]),
         vclass=tuple(data["vclass"]),
+        followed=tuple(data["followed"]),
         patience=float(data["patience"]),
         notes=tuple(data["notes"]),
         signs=tuple((float(t), str(edge), float(v)) for t, edge, v in data["signs"]),
@@ -254,12 +256,14 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
             scenario.order, dict(zip(ids, whole, strict=True)),
             {rails.edges[e]: rails.edges[f] for e, f in enumerate(rails.twin.tolist()) if f >= 0},
         )  # fmt: skip
-    given, told = None, list[str]()
+    given, followed, told = None, traffic.followed, list[str]()
     if not found and scenario.controller.law != "sumo":
         bare = mixed.unguarded([way_of(d.edges) for d in traffic.departures], ids, rails, traffic.signals)
         choice, told, wrong = mixed.chosen(driving, together, traffic.signals, bare, mixed.laps(edges, ids, rails))
         found += wrong
+        belonging = traffic.junctions, traffic.source.options, traffic.source.elements.others
         if choice == "obey":
+            followed += tuple(of_signals(*belonging, obeyed=True).followed)
             scenario = scenario.model_copy(update={"traffic": driving.model_copy(update={"signals": "obey"})})
             own = [ids[i] for i in np.flatnonzero(driven).tolist()]
             given = handed(traffic.source, ids, own, traffic.begin_s)
@@ -277,7 +281,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
             changes = changes if traffic.patience_s == math.inf else "who cannot enter for long does not come"
             wrong, notes = passages.without_solution(scenario.order, ids, edges, rails, place, size, margin, changes)
             found, told = [*found, *wrong], [*told, *notes]
-            told += of_signals(traffic.junctions, traffic.source.options, traffic.source.elements.others)
+            told += of_signals(*belonging, obeyed=False).named
     if found:
         raise InputError(list(dict.fromkeys(found)))
     departures = traffic.departures
@@ -295,6 +299,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
         cooperates=together,
         vclass=tuple(traffic.kinds[d.kind].vclass for d in departures),
         patience=traffic.patience_s,
+        followed=followed if scenario.controller.law != "sumo" else (),  # SUMO follows all of them itself
         notes=_changes(scenario, traffic)
         if scenario.controller.law == "sumo"
         else (

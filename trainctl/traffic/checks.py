@@ -49,10 +49,10 @@ def rail_trains(elements: Elements, kinds: dict[str, Kind]) -> tuple[list[Elemen
     return trains, notes
 
 
-def not_followed(
+def of_files(
     options: dict[str, str], trains: list[Element], elements: Elements, kinds: dict[str, Kind], net: NetFile
-) -> tuple[list[str], list[str]]:
-    """What of the files of a configuration is not followed, one line each; and what is refused."""
+) -> known.Said:
+    """What of the files of a configuration is followed, what is not, and what is refused; signals are left out."""
     own = {id(e) for t in trains for e in t.iter()}
     given = list({id(r): r for t in trains for r in routes_of(t, elements) if id(r) not in own}.values())
     named = {t.get("type", "DEFAULT_VEHTYPE") for t in trains}
@@ -60,8 +60,13 @@ def not_followed(
     types = [e for name, e in elements.types.items() if name in named and kinds[name].vclass in RAIL]
     stops = {place for t in (*trains, *given) for s in t.iter("stop") for tag in PLACES for place in (s.get(tag),) if place}
     places = [e for name, e in elements.places.items() if name in stops]
-    notes, refused = known.of_trains([*trains, *given, *types, *places])
-    return [*known.of_options(options), *notes, *known.of_others(elements.others, elements.unread), *known.of_net(net)], refused
+    those = (
+        known.of_options(options),
+        known.of_trains([*trains, *given, *types, *places]),
+        known.of_others(elements.others, elements.unread),
+    )
+    followed, not_followed, refused = ([line for part in those for line in part[k]] for k in range(3))
+    return known.Said(followed, [*not_followed, *known.of_net(net)], refused)
 
 
 def refuse(sumocfg: Path, net: Path, trains: list[Element], elements: Elements, kinds: dict[str, Kind], tracks: Tracks) -> None:

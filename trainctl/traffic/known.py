@@ -1,6 +1,7 @@
 """What is known of a SUMO configuration and its files: what is followed, and what is named or refused instead, in which words.
 
-The tables below decide. What stands in none of them is named too, so that nothing is passed over without a word.
+The tables below decide. What stands in none of them is named too, so that nothing is passed over without a word. What is
+followed is listed as well: who reads the list need not trust silence.
 """
 
 from __future__ import annotations
@@ -22,6 +23,14 @@ class Refused(NamedTuple):
     why: str
 
 
+class Said(NamedTuple):
+    """What is said of a configuration's files, one line each."""
+
+    followed: list[str]
+    named: list[str]  # not followed, with the reason
+    refused: list[str]
+
+
 def _words(*lines: str) -> frozenset[str]:
     return frozenset(word for line in lines for word in line.split())
 
@@ -34,8 +43,10 @@ OPTIONS = _words(
     "net-file route-files additional-files begin end scale scale-suffix max-depart-delay use-stop-ended",
     "default.departspeed",
     "railway.max-train-length weights.reversal-penalty weights.turnaround-penalty weights.minor-penalty weights.priority-factor",
-    "railsignal-moving-block",  # where signals are obeyed, see of_signals
 )
+
+#: That of which is said with the signals: see ``of_signals``.
+MOVING_BLOCK = "railsignal-moving-block"
 
 #: Options that cannot change the run of a train: what is written, drawn and checked, and how fast SUMO itself runs.
 OPTIONS_OF_NO_EFFECT = _words(
@@ -109,6 +120,7 @@ ELEMENTS: Mapping[str, frozenset[str]] = {
         _words("id lane startPos endPos friendlyPos"),
     ),
     "parkingArea": _words("id lane startPos endPos friendlyPos"),
+    "space": frozenset(),
 }  # fmt: skip
 
 #: Attributes that cannot change the run of a train.
@@ -132,6 +144,7 @@ OF_NO_EFFECT: Mapping[str, frozenset[str]] = {
         _words("name lines color personCapacity parkingLength group access angle width length",
                "power efficiency chargeInTransit chargeDelay chargeType"),
     ),
+    "space": _words("x y z width length angle slope"),
 }  # fmt: skip
 
 #: Attributes that are not followed: in which words, and the values with which they mean nothing.
@@ -219,68 +232,80 @@ NET_CONNECTION = _words(
 OPTIONS_NAMED_FROM = {"device.rerouting.": ("trains keep their routes", OFF)}
 
 
-def of_options(options: Mapping[str, str]) -> list[str]:
-    """What options of a configuration are not followed, one line each."""
-    lines = []
+def of_options(options: Mapping[str, str]) -> Said:
+    """What options of a configuration are followed, one line for all, and which are not, one line each."""
+    followed, lines = [], []
     for key, value in options.items():
-        if key in OPTIONS or key in OPTIONS_OF_NO_EFFECT or "output" in key or key.startswith(OF_NO_EFFECT_FROM):
+        if key == MOVING_BLOCK or key in OPTIONS_OF_NO_EFFECT or "output" in key or key.startswith(OF_NO_EFFECT_FROM):
             continue
         kind = next((said for start, said in OPTIONS_NAMED_FROM.items() if key.startswith(start)), (UNKNOWN, frozenset[str]()))
         words, idle = OPTIONS_NAMED.get(key, kind)
-        if value not in idle:
+        if key in OPTIONS or value in idle:
+            followed.append(key)
+        else:
             lines.append(f"option {key} = {value}: not followed: {words}")
-    return lines
+    return Said([f"options: {', '.join(followed)}"] if followed else [], lines, [])
 
 
-def of_trains(elements: Iterable[Element]) -> tuple[list[str], list[str]]:
-    """What the elements of trains, routes, stops and types say that is not followed, and what is refused.
+def of_trains(elements: Iterable[Element]) -> Said:
+    """What the elements of trains, routes, stops and types say: what of it is followed, what is not, and what is refused.
 
-    There is one line for each reason: attributes with the same reason share it, each with how often it stands there.
+    Of what is followed there is one line for each element, of the rest one for each reason: attributes with the same reason share
+    it, each with how often it stands there.
     """
     found = Counter(said for element in elements for one in element.iter() for said in _of_one(one))
+    followed: dict[str, list[str]] = {}
     named: dict[str, list[str]] = {}
     refused: dict[str, list[str]] = {}
-    for (what, said), n in found.items():
+    for (tag, key, said), n in found.items():
+        if said is None:
+            followed.setdefault(tag, []).append(f"{n} x {key}")
+            continue
         lines, why = (refused, said.why) if isinstance(said, Refused) else (named, said)
-        lines.setdefault(why, []).append(f"{n} x <{what}>")
-    return (
+        lines.setdefault(why, []).append(f"{n} x <{f'{tag} {key}'.rstrip()}>")
+    return Said(
+        [f"<{tag}>: {', '.join(keys)}" for tag, keys in followed.items()],
         [f"{', '.join(those)}: not followed: {why}" for why, those in named.items()],
         [f"{', '.join(those)}: {why}" for why, those in refused.items()],
     )
 
 
-def _of_one(element: Element) -> Iterator[tuple[str, str | Refused]]:
-    """What of one element is not followed, with the reason."""
+def _of_one(element: Element) -> Iterator[tuple[str, str, str | Refused | None]]:
+    """Element, attribute, and why it is not followed (None: it is) of all that one element says of the run of a train."""
     tag = element.tag
     if tag == "param" or tag.startswith("carFollowing-"):
         return
-    if tag not in ELEMENTS and tag != "space":
-        yield tag, UNKNOWN
+    if tag not in ELEMENTS:
+        yield tag, "", UNKNOWN
         return
     for key, value in element.items():
-        if key in ELEMENTS[tag] or key in OF_NO_EFFECT.get(tag, ()) or (tag == "vType" and key.startswith(("lc", "jm"))):
+        if key == "id" or key in OF_NO_EFFECT.get(tag, ()) or (tag == "vType" and key.startswith(("lc", "jm"))):
             continue
         said = NAMED.get((tag, key), (UNKNOWN, frozenset[str]()))
-        if isinstance(said, Refused):
-            yield f"{tag} {key}", said
-        elif value not in said[1]:
-            yield f"{tag} {key}", said[0]
+        if key in ELEMENTS[tag]:
+            yield tag, key, None
+        elif isinstance(said, Refused):
+            yield tag, key, said
+        else:
+            yield tag, key, None if value in said[1] else said[0]
 
 
-def of_others(elements: Iterable[Element], unread: Iterable[Element]) -> list[str]:
-    """What elements beside trains, routes, stops and types are not followed, one line for each kind.
+def of_others(elements: Iterable[Element], unread: Iterable[Element]) -> Said:
+    """What elements beside trains, routes, stops and types are followed, and which are not, one line for each kind.
 
     ``unread`` are those in route files that SUMO reads in additional files alone.
     """
-    passed = ELEMENTS.keys() | ELEMENTS_FOLLOWED | ELEMENTS_OF_NO_EFFECT | ELEMENTS_OF_SIGNALS.keys()
+    passed = ELEMENTS.keys() | ELEMENTS_OF_NO_EFFECT | ELEMENTS_OF_SIGNALS.keys()
     counts = Counter(e.tag for e in elements if e.tag not in passed)
-    lines = []
+    followed, lines = [], []
     for tag, n in counts.items():
-        words = ELEMENTS_NAMED.get(tag, UNKNOWN)
-        lines.append(f"{n} x <{tag}>: not followed: {words}")
+        if tag in ELEMENTS_FOLLOWED:
+            followed.append(f"<{tag}>: {n}")
+        else:
+            lines.append(f"{n} x <{tag}>: not followed: {ELEMENTS_NAMED.get(tag, UNKNOWN)}")
     for tag, n in Counter(e.tag for e in unread).items():
         lines.append(f"{n} x <{tag}> in route files: not followed, as in SUMO, which reads it in additional files alone")
-    return lines
+    return Said(followed, lines, [])
 
 
 def of_net(net: NetFile) -> list[str]:
@@ -293,16 +318,20 @@ def of_net(net: NetFile) -> list[str]:
     return lines
 
 
-def of_signals(signals: int, options: Mapping[str, str], elements: Iterable[Element]) -> list[str]:
-    """What is said of rail signals and all that belongs to them where they are not obeyed, one line for each."""
+def of_signals(signals: int, options: Mapping[str, str], elements: Iterable[Element], obeyed: bool) -> Said:
+    """What is said of rail signals and all that belongs to them, one line for each: followed where they are obeyed, else named."""
+    counts = Counter(e.tag for e in elements if e.tag in ELEMENTS_OF_SIGNALS)
+    value = options.get(MOVING_BLOCK, "")
+    if obeyed:
+        lines = [f"net: {signals} x rail signals"] if signals else []
+        lines += [f"options: {MOVING_BLOCK}"] if value else []
+        return Said([*lines, *(f"<{tag}>: {n}" for tag, n in counts.items())], [], [])
     lines = (
         [f"net: {signals} x rail signals: not obeyed: our own interlocking keeps trains apart in moving block"] if signals else []
     )
-    value = options.get("railsignal-moving-block", "")
     if value not in OFF:
-        lines.append(f"option railsignal-moving-block = {value}: not followed: trains are kept apart in moving block anyway")
-    counts = Counter(e.tag for e in elements if e.tag in ELEMENTS_OF_SIGNALS)
-    return [*lines, *(f"{n} x <{tag}>: not followed: {ELEMENTS_OF_SIGNALS[tag]}" for tag, n in counts.items())]
+        lines.append(f"option {MOVING_BLOCK} = {value}: not followed: trains are kept apart in moving block anyway")
+    return Said([], [*lines, *(f"{n} x <{tag}>: not followed: {ELEMENTS_OF_SIGNALS[tag]}" for tag, n in counts.items())], [])
 
 
 def _unknown(net: NetFile) -> Iterator[str]:

@@ -17,7 +17,7 @@ from sumo_net.netfile import RAIL
 from trainctl import draws
 from trainctl.errors import InputError
 from trainctl.traffic import crossings
-from trainctl.traffic.checks import not_followed, rail_trains, refuse
+from trainctl.traffic.checks import of_files, rail_trains, refuse
 from trainctl.traffic.choices import Choice, choices
 from trainctl.traffic.closings import Closing, closings
 from trainctl.traffic.duarouter import ROUTING, expand
@@ -95,6 +95,7 @@ class Configuration(NamedTuple):
     end_s: float | None
     step_s: float
     patience_s: float  # after this time trains that could not enter do not come any more; inf: they always do
+    followed: tuple[str, ...]  # what is; signals and what belongs to them are left out
     notes: tuple[str, ...]  # what is not followed
     signs: tuple[Change, ...]  # variable speed signs
     closings: tuple[Closing, ...]
@@ -167,13 +168,13 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         raise InputError(wrong)
     kinds = {name: kind_of(element) for name, element in (default_types() | elements.types).items()}
     trains, notes = rail_trains(elements, kinds)
-    more_notes, refused = not_followed(options, trains, elements, kinds, tracks.file)
-    if refused:
-        raise InputError([f"{sumocfg}: {line}" for line in refused])
+    told = of_files(options, trains, elements, kinds, tracks.file)
+    if told.refused:
+        raise InputError([f"{sumocfg}: {line}" for line in told.refused])
     signs, wrong = speed_signs(elements.others, tracks)
     closed, rerouter_notes, mistakes = closings(elements.others, tracks, {k.vclass for k in kinds.values()})
     drawn, drawn_notes, wrong_draws = choices(elements.others, elements.routes, tracks)
-    more_notes += [*rerouter_notes, *drawn_notes]
+    more_notes = [*told.named, *rerouter_notes, *drawn_notes]
     wrong += [*mistakes, *wrong_draws]
     if wrong:
         raise InputError([f"{sumocfg}: {line}" for line in wrong])
@@ -225,6 +226,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         end_s=own_end,
         step_s=times["step-length"],
         patience_s=seconds(patience) if seconds(patience) >= 0 else math.inf,
+        followed=tuple(told.followed),
         notes=(*notes, *more_notes),
         signs=tuple(signs),
         closings=tuple(closed),

@@ -313,6 +313,28 @@ def test_what_is_not_followed_is_told(files: Files) -> None:
     )
 
 
+def test_what_is_followed_is_listed(files: Files) -> None:
+    traffic = files.read(
+        f'{V} route="main" arrivalPos="40" color="red"><stop lane="bc_0" endPos="60" duration="3" parking="true" triggered="true"/></vehicle>',
+        stops=STOPS.replace("</additional>", '<variableSpeedSign id="s" lanes="bc_0"><step time="0" speed="9"/></variableSpeedSign></additional>'),
+    )  # fmt: skip
+    said = dict(line.split(": ", 1) for line in traffic.followed)
+    assert {"net-file", "route-files", "begin"} <= set(said["options"].split(", "))
+    assert said["<vehicle>"] == "1 x type, 1 x depart, 1 x route, 1 x arrivalPos"
+    assert said["<stop>"] == "1 x lane, 1 x endPos, 1 x duration, 1 x parking"  # nobody boards: that is named
+    assert said["<variableSpeedSign>"] == "1"
+
+
+def test_places_drawn_in_a_parking_area_are_nothing_to_follow(files: Files) -> None:
+    area = '<parkingArea id="yard" lane="bc_0" startPos="0" endPos="90"><space x="5" y="5"/></parkingArea></additional>'
+    traffic = files.read(
+        f'{V} route="main"><stop parkingArea="yard" duration="3"/></vehicle>', stops=STOPS.replace("</additional>", area)
+    )
+    assert traffic.departures[0].stops[0].parks
+    assert "<parkingArea>: 1 x lane, 1 x startPos, 1 x endPos" in traffic.followed
+    assert not [line for line in (*traffic.notes, *traffic.followed) if "space" in line]
+
+
 def test_what_nobody_thought_of_is_named(files: Files) -> None:
     files.write(
         f'{V} route="main" flavour="sweet" color="red"><stop lane="bc_0" endPos="60" duration="3" mood="good"/><mystery/></vehicle>'
