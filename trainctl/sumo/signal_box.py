@@ -6,7 +6,7 @@ driver wants is overruled all the same. SUMO lets no train in before the block i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -40,6 +40,7 @@ class Obeyed(NamedTuple):
     driven: Bools  # (n,) trains that SUMO drives
     signals: tuple[tuple[str, int], ...]  # program and link of every signal, by its number
     alone: tuple[tuple[int, ...], ...]  # what ``alone_on`` says of every signal
+    entries: tuple[tuple[tuple[int, tuple[int, ...]], ...], ...]  # what ``entries`` says of every signal
     braking: Floats  # (n,) m/s2, what trains of ours brake with
     rails: Rails
     legs: tuple[tuple[tuple[str, ...], ...], ...]  # routes in parts, see ``Roster``
@@ -70,7 +71,9 @@ def obeyed(p: Model) -> Obeyed | None:
     index = p.rails.index
     at = [(index.get(one.edge, -1), index.get(one.onward, -1)) for one in p.roster.signals]
     alone = tuple(alone_on(p.rails, edge, set(at)) if edge >= 0 else () for edge, _ in at)
-    return Obeyed(handed, p.roster.driven, signals, alone, rate, p.rails, p.roster.legs)
+    number = {pair: k for k, pair in enumerate(at)}
+    others = tuple(entries(p.rails, *pair, number) if min(pair) >= 0 else () for pair in at)
+    return Obeyed(handed, p.roster.driven, signals, alone, others, rate, p.rails, p.roster.legs)
 
 
 def alone_on(rails: Rails, edge: int, signals: Collection[tuple[int, int]]) -> tuple[int, ...]:
@@ -78,17 +81,62 @@ def alone_on(rails: Rails, edge: int, signals: Collection[tuple[int, int]]) -> t
 
     () where there is a switch, a crossing or a track for both directions. ``signals`` are pairs of edges with a signal between.
     """
+    if rails.twin[edge] >= 0 or rails.crossing[edge]:
+        return ()
+    if not rails.after[edge]:
+        return (edge,)
+    onward = rails.after[edge][0]
+    if len(rails.after[edge]) > 1 or len(rails.before[onward]) > 1:
+        return ()
+    rest = plain(rails, onward, signals)
+    return (edge, *rest) if rest and edge not in rest else ()
+
+
+def plain(rails: Rails, edge: int, signals: Collection[tuple[int, int]]) -> tuple[int, ...]:
+    """Edges from ``edge`` up to the next signal; () where a switch, a crossing or a track for both directions comes before it."""
     found = [edge]
     while True:
         here = found[-1]
         if rails.twin[here] >= 0 or rails.crossing[here]:
             return ()
-        ends = [(here, onward) in signals for onward in _normal_after(rails, here)] if here != edge else [False]
-        if not rails.after[here] or all(ends):
+        if not rails.after[here] or all((here, onward) in signals for onward in _normal_after(rails, here)):
             return tuple(found)
         if len(rails.after[here]) > 1 or len(rails.before[rails.after[here][0]]) > 1 or rails.after[here][0] in found:
             return ()
         found.append(rails.after[here][0])
+
+
+def entries(
+    rails: Rails, edge: int, onward: int, signals: Mapping[tuple[int, int], int]
+) -> tuple[tuple[int, tuple[int, ...]], ...]:
+    """Where others come onto the track behind the signal between two edges: past which signals, and over which edges to these.
+
+    The edges go back from the signal, as far as nothing leads onto or off the track. () where nobody else comes, where
+    somebody comes past no signal, and where a block is more than a track with one end: a switch, a crossing, a track for both directions.
+    """
+    if not plain(rails, onward, signals):
+        return ()
+    found = []
+    for first in rails.before[onward]:
+        from_, inside = first, []
+        while rails.internal[from_]:
+            inside.append(from_)
+            if len(rails.before[from_]) != 1:
+                return ()
+            from_ = rails.before[from_][0]
+        crossed = {other for here in inside for other in rails.crossing[here]}
+        if rails.twin[from_] >= 0 or (from_, onward) not in signals or any(onward not in _normal_after(rails, e) for e in crossed):
+            return ()
+        if from_ == edge:
+            continue
+        back = [from_]
+        while len(rails.before[back[-1]]) == 1 and rails.before[back[-1]][0] not in back:
+            before = rails.before[back[-1]][0]
+            if len(rails.after[before]) != 1 or rails.twin[before] >= 0 or rails.crossing[before]:
+                break
+            back.append(before)
+        found.append((signals[from_, onward], tuple(back)))
+    return tuple(found)
 
 
 def _normal_after(rails: Rails, edge: int) -> Iterator[int]:
@@ -133,6 +181,7 @@ class Box:
         self.parked: list[int] = []
         self.claims: list[list[int]] = []
         self.contested: dict[int, bool] = {}  # by signal, as far as it was asked for
+        self.entries: dict[int, tuple[tuple[int, tuple[int, ...]], ...]] = {}  # by signal, as far as these were asked for
         self.held: dict[tuple[int, int], set[tuple[str, str]]] = {}  # for each claim: signal and trip of those it holds
 
     def green(self, signals: Ints) -> Bools:
@@ -163,6 +212,8 @@ class Box:
         for claim in sorted(claims):
             name, link = self.obeyed.signals[claim[1]]
             held = self.held.setdefault(claim, set())
+            if held and self._behind_held(claim[1], held):
+                continue
             for rival in lights.getRivalVehicles(name, link):
                 ahead = self.session.api.vehicle.getNextTLS(rival)
                 red = [one[0] for one in ahead if one[3] not in "Gg"]  # one that has just come has green until it is asked for
@@ -171,6 +222,30 @@ class Box:
                     if (at, trip) not in held:
                         held.add((at, trip))
                         lights.addConstraint(at, trip, name, NOBODY, 0, 1)
+
+    def _behind_held(self, signal: int, held: set[tuple[str, str]]) -> bool:
+        """Whether all that could still be given what this signal gives are behind trains that are held already.
+
+        To ask for rivals while one is held takes SUMO a look at every train it has, for each train that holds a signal.
+        """
+        if (entries := self.entries.get(signal)) is None:
+            edges, lanes = self.obeyed.rails.edges, self.session.api.edge.getLaneNumber
+            entries = self.obeyed.entries[signal]
+            entries = entries if all(lanes(edges[e]) == 1 for _, back in entries for e in back) else ()
+            self.entries[signal] = entries
+        return bool(entries) and all((self.obeyed.signals[at][0], self._foremost(back)) in held for at, back in entries)
+
+    def _foremost(self, back: tuple[int, ...]) -> str:
+        """Trip of the first train on these edges, which lead back from a signal; "" if there is none.
+
+        A train that is parked is on no lane, so whoever is behind it is the first one.
+        """
+        edges, trips = self.session.api.edge, self.obeyed.handed.trips
+        for edge in back:
+            if trains := edges.getLastStepVehicleIDs(self.obeyed.rails.edges[edge]):
+                foremost = trains[-1]
+                return trips[self.number[foremost]] if foremost in self.number else foremost
+        return ""
 
     def _contested(self, signal: int) -> bool:
         """Whether another train could be given what this signal gives: to ask SUMO takes longer than all the rest of a step."""

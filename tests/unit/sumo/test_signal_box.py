@@ -1,4 +1,4 @@
-"""Which signals no other train can want: only there SUMO need not be asked for rivals."""
+"""Which signals no other train can want, and past which signals others come to what a signal gives: there SUMO need not be asked."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from sumo_net import Rails
 from sumo_net.netfile import read_net
-from trainctl.sumo.signal_box import alone_on
+from trainctl.sumo.signal_box import alone_on, entries
 from trainctl.traffic.rail_signals import rail_signals
 
 #: A line with signals at b, c and e; at d another one joins, and its last edge can be run over both ways.
@@ -33,3 +33,67 @@ def test_up_to_the_next_signal_on_plain_track_nobody_else_comes(alone):
 def test_before_a_join_and_on_track_for_both_directions_others_may_want_what_a_signal_gives(alone):
     assert alone("bc") == []
     assert alone("de") == []
+
+
+#: Two lines that merge at m, where one of them has a join before the signal, and a crossing of the other with a third line.
+MERGING = {
+    "a": (0, 0), "b": (1000, 0), "m": (3000, 0), "x": (4000, 0), "y": (5000, 0),
+    "s": (0, 900), "t": (1000, 900), "u": (1000, 1800), "v": (2000, 500), "z": (5000, 600),
+}  # fmt: skip
+TRACKS = {
+    "ab": ("a", "b"), "bm": ("b", "m"), "mx": ("m", "x"), "xy": ("x", "y"),
+    "st": ("s", "t"), "ut": ("u", "t"), "tv": ("t", "v"), "vm": ("v", "m"),
+}  # fmt: skip
+
+
+@pytest.fixture
+def beyond(tmp_path):
+    def found(tracks, signals, edge, onward, places=MERGING):
+        nets.net(tmp_path, places, tracks, signals=signals)
+        rails = Rails.read(tmp_path / "a.net.xml")
+        index = rails.index
+        numbers = {(index[s.edge], index[s.onward]): k for k, s in enumerate(rail_signals(read_net(tmp_path / "a.net.xml")))}
+        pairs = {k: tuple(rails.edges[e] for e in pair) for pair, k in numbers.items()}
+        return [
+            (pairs[at], [rails.edges[e] for e in back if not rails.internal[e]])
+            for at, back in entries(rails, index[edge], index[onward], numbers)
+        ]
+
+    return found
+
+
+def test_others_come_to_a_join_past_its_other_signal_over_the_track_back_to_a_switch(beyond):
+    assert beyond(TRACKS, "mx", "bm", "mx") == [(("vm", "mx"), ["vm", "tv"])]
+    assert beyond(TRACKS, "mx", "vm", "mx") == [(("bm", "mx"), ["bm", "ab"])]
+    assert beyond({**TRACKS, "vz": ("v", "z")}, "mx", "bm", "mx") == [(("vm", "mx"), ["vm"])]
+    assert beyond(TRACKS, "bmx", "ab", "bm") == []  # nobody else comes there
+
+
+@pytest.mark.parametrize(
+    ("more", "signals"),
+    [
+        ({"xz": ("x", "z")}, "mx"),  # x leads to two tracks, but the block ends there
+        ({}, "m"),  # to its end
+    ],
+)
+def test_a_block_ends_at_the_next_signal_or_where_the_track_does(beyond, more, signals):
+    assert beyond({**TRACKS, **more}, signals, "bm", "mx")
+
+
+@pytest.mark.parametrize(
+    ("more", "signals"),
+    [
+        ({"xz": ("x", "z")}, "m"),  # a switch in the block
+        ({"vx": ("v", "x")}, "m"),  # a join in the block
+        (nets.both_ways("mx", "m", "x"), "mx"),  # a block for both directions
+        (nets.both_ways("vm", "v", "m"), "mx"),  # an entry for both directions
+    ],
+)
+def test_where_a_block_is_no_plain_track_sumo_is_asked(beyond, more, signals):
+    assert not beyond({**TRACKS, **more}, signals, "bm", "mx")
+
+
+def test_where_tracks_cross_before_a_block_sumo_is_asked(beyond):
+    places = {"w": (0, 0), "m": (1000, 0), "e": (2000, 0), "n": (1000, 1000), "s": (1000, -1000), "k": (0, -700)}
+    tracks = {"wm": ("w", "m"), "me": ("m", "e"), "km": ("k", "m"), "nm": ("n", "m"), "ms": ("m", "s")}
+    assert not beyond(tracks, "m", "wm", "me", places)
