@@ -112,7 +112,7 @@ def entries(
     """Where others come onto the track behind the signal between two edges: past which signals, and over which edges to these.
 
     The edges go back from the signal, as far as nothing leads onto or off the track. () where nobody else comes, where
-    somebody comes past no signal, and where a block is more than a track with one end: a switch, a crossing, a track for both directions.
+    somebody comes past no signal, and where a block is more than plain track: a switch, a crossing, a track for both directions.
     """
     if not plain(rails, onward, signals):
         return ()
