@@ -17,6 +17,7 @@ from typing import Any
 
 import numba
 from numba.core import caching
+from numba.np import linalg
 
 config: Any = numba.config
 Index: Any = caching.IndexDataCacheFile
@@ -38,6 +39,21 @@ def _load_index(file: Any, load: Any = Index._load_index) -> Any:
 
 
 Index._load_index = _load_index
+
+
+def _know_of_blas() -> None:
+    """Tell numba that there is a BLAS, which comes with scipy.
+
+    It imports ``scipy.linalg`` in each process to find out, 0.14 s; code that calls BLAS still has it imported when it is compiled.
+    """
+    asked, linalg.ensure_blas = linalg.ensure_blas, lambda: None
+    try:
+        from numba.np import arraymath  # noqa: F401  asks while it is imported
+    finally:
+        linalg.ensure_blas = asked
+
+
+_know_of_blas()
 
 
 @cache

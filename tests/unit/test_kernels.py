@@ -34,3 +34,15 @@ def test_a_folder_that_others_can_write_into_is_not_trusted(tmp_path):
     place, said = kept(HOME="/proc/nowhere", TMPDIR=str(tmp_path))
     assert place.parent != planted and place.is_relative_to(tmp_path)
     assert "compiled again" in said
+
+
+def test_linear_algebra_is_loaded_only_where_it_is_compiled():
+    """Numba would import scipy.linalg, longer than itself, for whatever it compiles; products of matrices are still compiled."""
+    code = (
+        "import sys, trainctl.signals, numba, numpy as np\n"
+        "double = numba.njit(lambda a: 2.0 * a); double(np.ones(3)); before = 'scipy.linalg' in sys.modules\n"
+        "times = numba.njit(lambda a, b: a @ b); a = np.arange(9.0).reshape(3, 3)\n"
+        "print(before, np.array_equal(times(a, a), a @ a))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False True"
