@@ -269,7 +269,7 @@ def _driven(
                 journal.event(at, "violation", **alarm)
             end = {"steps": simulation.k, **simulation.outcome()}
             logs = {name: sum_of(partial / name) for name in written(partial) if name.startswith("sumo/")}
-            recorded = journal.recorder.cut(synced=every_s is not None)
+            recorded = journal.cut(synced=every_s is not None)
             done = {"end": plain(end), "wall_time_s": elapsed(), "recorder": recorded, "files": logs}
             checkpoint.replace(place / checkpoint.DONE, sealed(done))
             _complete(p, partial, info, {**done, "wall_time_s": elapsed()}, journal)
@@ -330,7 +330,7 @@ class _Between:
     def __call__(self) -> None:
         asked = self.stop.asked
         if self.tape is not None and (asked is not None or self.simulation.k % self.every == 0):
-            more = {"recorder": self.journal.recorder.cut(synced=True), "tape": self.tape.save(), "wall_time_s": self.elapsed()}
+            more = {"recorder": self.journal.cut(synced=True), "tape": self.tape.save(), "wall_time_s": self.elapsed()}
             assert isinstance(self.simulation, Loop)
             checkpoint.write(self.place, self.simulation, {**self.identity, **more})
         if asked is not None:

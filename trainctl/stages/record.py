@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 #: A killed run loses at most what it recorded in this time [s].
 SAVE_EVERY_S = 10.0
 
+#: Rows of trains that are written together: of few trains each call of numpy costs more than the numbers.
+TOGETHER = 256
+
 #: Columns of trains.parquet in a run with disturbances, as in ``plants.Disturbed``.
 DISTURBANCES = (
     "disturbance_position_m", "disturbance_speed_mps", "disturbance_input_mps2", "resistance_factor", "measurement_error_m",
@@ -53,19 +56,21 @@ class Journal:
         )  # fmt: skip
         self.recorder = Recorder(folder, tables, {"scenario_sha256": p.scenario.hash()}, resume=resume)
         self.saved = time.monotonic()
+        self.rows: list[columns.Instant] = []  # not written yet
         self.train_of_unit = np.repeat(np.arange(len(p.scenario.train)), np.diff(p.consists.first))
-        self.unit = p.unit
         self.lengths = self.train_length = p.consists.train_length()
         self.trains = np.arange(len(self.lengths))
 
     def serve(self, trains: Ints | None) -> None:
         """From now on rows come of these trains (k,), of their numbers in the scenario; None: of all."""
+        self._write()
         self.trains = np.arange(len(self.lengths)) if trains is None else trains
         self.train_length = self.lengths[self.trains]
 
     def turned(self, p: Model) -> None:
         """Take over a scenario with the units of some trains in another order."""
-        self.p, self.unit = p, p.unit
+        self._write()
+        self.p = p
 
     def event(self, time: float, kind: str, **fields: Any) -> None:
         """One line of events.jsonl."""
@@ -76,47 +81,55 @@ class Journal:
     def write(self, row: Row) -> None:
         """One instant of every table. Every few seconds what was written is closed, so that a killed run keeps it."""
         if time.monotonic() - self.saved > SAVE_EVERY_S:
-            self.recorder.cut()
+            self.cut()
             self.saved = time.monotonic()
-        trains, n, here = self.trains, len(row.ahead), slice(None) if row.seen.present.all() else np.flatnonzero(row.seen.present)
-        now = columns.trains(row, self.train_length)
-        numbers: dict[str, Any] = {name: value(now) for name, value in columns.TRAINS.items()}
-        if self.has_units:
-            numbers |= self._units(row)
-        if self.has_energies:
-            assert row.extremes is not None
-            numbers |= {name: row.extremes.energy[:, q] for q, name in enumerate(ENERGIES)}
-        if self.disturbances:
-            acting = [np.full(n, np.nan)] * len(self.disturbances) if row.disturbed is None else row.disturbed
-            numbers |= dict(zip(self.disturbances, acting, strict=True))
-        if self.formed:
-            numbers["in_formation"] = row.led.astype(float)
-        numbers |= {"train": trains, "track": row.track, "edge": row.seen.edge, "saturated": row.saturated}
-        if row.seen.present.any():
-            self.recorder.write("trains", time_s=row.time, **{name: column[here] for name, column in numbers.items()})
-        links = row.links
-        if len(links.sender):
-            self.recorder.write(
-                "links", time_s=row.time, sender=trains[links.sender], receiver=trains[links.receiver], heard=links.heard,
-                **{name: value(row) for name, value in columns.LINKS.items()},
-            )  # fmt: skip
+        now = columns.instant(row, bool(self.disturbances))
+        if self.rows and not columns.alike(now, self.rows[0]):
+            self._write()
+        self.rows.append(now)
+        if len(self.rows) * len(now.position) >= TOGETHER:
+            self._write()
+        else:
+            self.rows[-1] = columns.kept(now)
 
-    def _units(self, row: Row) -> dict[str, Any]:
-        """Write the units; returns the further columns of the trains."""
-        now = columns.units(row, self.p.consists)
-        units = np.lexsort((self.unit, self.train_of_unit))  # as they were built, whichever way they run
-        units = units[row.seen.present[self.train_of_unit[units]]]
-        missing = np.full(len(self.unit), np.nan)
-        values: dict[str, Any] = {
-            "train": self.train_of_unit, "unit": self.unit, **{name: value(now) for name, value in columns.UNITS.items()},
-            **(row.motion.extras if row.motion is not None else dict.fromkeys(self.extras, missing)),
-        }  # fmt: skip
-        if row.seen.present.any():
-            self.recorder.write("units", time_s=row.time, **{name: column[units] for name, column in values.items()})
-        x, finite = now.extremes, columns.finite
-        further = {f"{name}_min": finite(x.watched_min[:, q]) for q, name in enumerate(self.watched)}
-        further |= {f"{name}_max": finite(x.watched_max[:, q]) for q, name in enumerate(self.watched)}
-        return further
+    def _write(self) -> None:
+        """Write the instants that wait for it."""
+        if not self.rows:
+            return
+        now, self.rows = columns.placed(columns.together(self.rows), self.train_length), []
+        self._append("trains", now, now.present, self._of_trains(now))
+        links: dict[str, Any] = {name: value(now) for name, value in columns.LINKS.items()}
+        links |= {"sender": self.trains[now.sender], "receiver": self.trains[now.receiver], "heard": now.heard}
+        self._append("links", now, np.ones(now.sender.shape, bool), links)
+        if self.has_units:
+            order = np.lexsort((self.p.unit, self.train_of_unit))  # as they were built, whichever way they run
+            units = {name: number[..., order] for name, number in self._of_units(now).items()}
+            self._append("units", now, now.present[:, self.train_of_unit[order]], units)
+
+    def _of_trains(self, now: columns.Instant) -> dict[str, Any]:
+        """Columns of the trains."""
+        numbers: dict[str, Any] = {name: value(now) for name, value in columns.TRAINS.items()}
+        for end, watched in (("min", now.watched_min), ("max", now.watched_max)):
+            numbers |= {f"{name}_{end}": columns.finite(watched[..., q]) for q, name in enumerate(self.watched)}
+        numbers |= {name: now.energy[..., q] for q, name in enumerate(ENERGIES) if self.has_energies}
+        numbers |= {name: now.disturbed[:, q] for q, name in enumerate(self.disturbances)}
+        if self.formed:
+            numbers["in_formation"] = now.led.astype(float)
+        return numbers | {"train": self.trains, "track": now.track, "edge": now.edge, "saturated": now.saturated}
+
+    def _of_units(self, now: columns.Instant) -> dict[str, Any]:
+        """Columns of the units."""
+        units = columns.units(now, self.p.consists)
+        numbers: dict[str, Any] = {name: value(units) for name, value in columns.UNITS.items()}
+        missing = np.full(now.force.shape, np.nan)  # at the end
+        numbers |= {name: now.extras[:, q] if now.extras.size else missing for q, name in enumerate(self.extras)}
+        return numbers | {"train": self.train_of_unit, "unit": self.p.unit}
+
+    def _append(self, table: str, now: columns.Instant, kept: Bools, numbers: Mapping[str, Any]) -> None:
+        """Append the rows that are ``kept`` (K, rows) of ``numbers`` (K, rows) or (rows,), instant after instant."""
+        if kept.any():
+            numbers = {"time_s": np.asarray(now.time)[:, None], **numbers}
+            self.recorder.write(table, **{name: np.broadcast_to(number, kept.shape)[kept] for name, number in numbers.items()})
 
     def call(self, train: int, call: columns.Call, edge: int) -> None:
         """One row of the stops: a train that has left one, or that comes no more before the end of the run."""
@@ -125,17 +138,27 @@ class Journal:
             "stops", train=[int(self.trains[train])], stop=self.stops.index(call.stop.name), platform=edge, **numbers
         )
 
+    def cut(self, synced: bool = False) -> dict[str, Any]:
+        """All rows until now survive a kill, see ``Recorder.cut``."""
+        self._write()
+        return self.recorder.cut(synced)
+
     def join(self) -> None:
         """Complete the tables; the segments they are made from stay."""
+        self._write()
         self.recorder.join()
 
     def close(self) -> None:
         """Complete the files."""
+        self._write()
         self.recorder.close()
 
     def leave(self) -> None:
         """End, with what was written in closed segments, from which the run can be resumed."""
-        self.recorder.leave()
+        try:
+            self._write()
+        finally:
+            self.recorder.leave()
 
 
 class State(NamedTuple):
