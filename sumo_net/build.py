@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sumo_net import kept
 from sumo_net.layout import Edge, Floats, Gradient, edges, gradient
 from sumo_net.spec import TRACK_SPACING_M, LineError, LineSpec, text
 
@@ -75,18 +76,23 @@ def _convert(name: str, folder: Path) -> None:
         "output-file": f"{name}.net.xml", "precision": "9", "no-internal-links": "true", "no-turnarounds": "true",
         "offset.disable-normalization": "true", "junctions.minimal-shape": "true", "xml-validation": "never",
     }  # fmt: skip
-    command = [str(program), *(word for key, value in options.items() for word in (f"--{key}", value))]
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    net = folder / f"{name}.net.xml"
+    command = [word for key, value in options.items() for word in (f"--{key}", value)]
+    net, known = folder / f"{name}.net.xml", kept.key(program, command, sorted(folder.iterdir()))
+    if (content := kept.find(known)) is not None:
+        net.write_bytes(content)
+        return
+    done = subprocess.run([str(program), *command], cwd=folder, env=environment, capture_output=True, text=True, check=False)
     if done.returncode != 0 or not net.exists():
         words = done.stderr.splitlines()
         said = [line for line in words if line.startswith("Error")] or words[-1:] or ["it does not say why"]
         raise LineError([f"{name}: netconvert refused the line: {line}" for line in said])
-    content = net.read_text(encoding="utf-8")
+    made = net.read_text(encoding="utf-8")
     # The header has the date and the folder in it: the same line must give the same file.
-    version = re.search(r"netconvert ([\w.+-]+)", content)
+    version = re.search(r"netconvert ([\w.+-]+)", made)
     header = f"<!-- line {name.replace('--', '- -')}, built by sumo_net with netconvert {version[1] if version else ''} -->"
-    net.write_text(_HEADER.sub(lambda _: header, content, count=1), encoding="utf-8")
+    content = _HEADER.sub(lambda _: header, made, count=1).encode()
+    net.write_bytes(content)
+    kept.keep(known, content)
 
 
 def _node(track: str, position: float) -> str:

@@ -16,7 +16,7 @@ import pytest
 from nets import HILLY
 
 import sumo_net
-from sumo_net import Line, LineError, LineSpec, build, parse_spec, read_spec
+from sumo_net import Line, LineError, LineSpec, build, kept, parse_spec, read_spec
 from sumo_net.build import netconvert
 
 SIGNALLED = HILLY | {"name": "signalled", "signals_m": 1000.0}
@@ -73,11 +73,12 @@ def test_the_net_gives_back_the_very_line_it_was_built_from(nets, three, name):
     np.testing.assert_array_equal(read.gradient.slope, built.gradient.slope)
 
 
-def test_the_same_line_gives_the_same_bytes_and_nothing_else_is_left(nets, three, tmp_path: Path):
+def test_the_same_line_gives_the_same_bytes_and_nothing_else_is_left(nets, three, tmp_path: Path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # netconvert makes it again
     began = time.perf_counter()
-    build(three, tmp_path)
+    build(three, tmp_path / "net")
     print(f"three_tracks built in {time.perf_counter() - began:.2f} s")
-    files = sorted(tmp_path.iterdir())
+    files = sorted((tmp_path / "net").iterdir())
     assert [f.name for f in files] == [f"three_tracks.{kind}.xml" for kind in ("con", "edg", "net", "nod")]
     for file in files:
         assert file.read_bytes() == (nets["three_tracks"].parent / file.name).read_bytes()
@@ -171,6 +172,36 @@ def test_height_is_the_gradient_added_up(nets, start):
         libsumo.simulationStep()
         at = np.clip(where() - line.gradient.breaks, 0.0, np.diff(line.gradient.breaks, append=np.inf))
         assert libsumo.vehicle.getPosition3D("a")[2] == pytest.approx(float(at @ np.sin(angle)), abs=1e-6)
+
+
+def test_a_net_is_made_once(tmp_path: Path, three, monkeypatch):
+    """Another line, or what is damaged in the cache, is made anew; where nothing can be kept, each time."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    run, runs = subprocess.run, list[list[str]]()
+    monkeypatch.setattr(subprocess, "run", lambda command, **more: runs.append(command) or run(command, **more))
+    first = build(three, tmp_path / "first").read_bytes()
+    assert build(three, tmp_path / "second").read_bytes() == first
+    assert len(runs) == 1
+    build(parse_spec(HILLY, ""), tmp_path / "hilly")
+    assert len(runs) == 2
+    folder = tmp_path / "cache" / "trainctl" / "nets"
+    assert len(list(folder.iterdir())) == 2
+    for path in folder.iterdir():
+        path.write_bytes(path.read_bytes()[:-100])
+    assert build(three, tmp_path / "third").read_bytes() == first
+    assert len(runs) == 3
+    folder.chmod(0o777)
+    assert build(three, tmp_path / "fourth").read_bytes() == first
+    assert len(runs) == 4
+
+
+def test_only_so_many_nets_are_kept(tmp_path: Path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(kept, "MOST", 3)
+    for k in range(5):
+        kept.keep(f"{k}", b"net %d" % k)
+    assert [kept.find(f"{k}") for k in range(5)] == [None, None, b"net 2", b"net 3", b"net 4"]
+    assert kept.key(Path(sys.executable), ("a", "b"), ()) != kept.key(Path(sys.executable), ("ab",), ())
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path, three):
