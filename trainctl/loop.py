@@ -72,6 +72,7 @@ class Loop(Steps):
         self.world, self.built = world, model
         p, run = model, model.scenario.run
         self.ours = ~p.roster.driven
+        self.all_ours = bool(self.ours.all())
         self.train = np.repeat(np.arange(len(p.leading)), np.diff(p.consists.first))  # (U,) of every unit
         self.disturbances = disturbance.signals(p.scenario.disturbance, p.scenario.ids, run.step_s, run.seed, p.worst)
         self.rerouters = rerouters.Rerouters(p, journal)
@@ -97,23 +98,20 @@ class Loop(Steps):
 
         # measure: SUMO -> where every train is on its way; its units follow, as a whole
         own = self.measured(s)
+        speed = own[leading, SPEED]
 
         # orders: new routes first, since they change the rows of all trains
         def stops_in() -> Floats:
             acceleration = self.plant.acceleration(own)
-            return supervisor.way_to_stop(
-                p.supervision, p.assumed, own[leading, SPEED], acceleration, p.scenario.run.step_s, p.step_theta
-            )
+            return supervisor.way_to_stop(p.supervision, p.assumed, speed, acceleration, p.scenario.run.step_s, p.step_theta)
 
-        ordered, routes = self.orders.step(
-            t, world.measure(), world.ways, own[leading, SPEED], stops_in, s.formed.ahead, s.orders
-        )  # fmt: skip
+        ordered, routes = self.orders.step(t, world.measure(), world.ways, speed, stops_in, s.formed.ahead, s.orders)
         stuck, led = self.rerouters.step(
-            t, world.measure(), world.ways, own[leading, SPEED], stops_in, s.rerouters, [i for i, _ in routes]
+            t, world.measure(), world.ways, speed, stops_in, s.rerouters, [i for i, _ in routes]
         )  # fmt: skip
         for i, edges in [*routes, *led]:
             world.route(i, edges)
-        here, ways, speed = world.measure(), world.ways, own[leading, SPEED]
+        here, ways = world.measure(), world.ways
 
         # signals: what they show -> how far every train may go before one, where they are obeyed
         shown, red = self.signals.step(t, ways, here, speed, s.traffic, world.box, s.signals)
@@ -126,10 +124,8 @@ class Loop(Steps):
         for i, v in around.entries:
             own[p.consists.first[i] : p.consists.first[i + 1], SPEED] = v
             world.insert(i, v)
-        for i in np.flatnonzero((going.parked != s.traffic.parked) & self.ours).tolist():
-            world.park(i, bool(going.parked[i]))
-        for i in np.flatnonzero((going.standing != s.traffic.standing) & ~(going.parked | s.traffic.parked) & self.ours).tolist():
-            world.halt(i, bool(going.standing[i]))
+        if going is not s.traffic:
+            self._stop(going, s.traffic)
 
         # topology: -> who receives from whom, desired spacing and bounds of each link, the law's constants
         seen = here._replace(position=here.position + s.formed.offset)
@@ -154,7 +150,8 @@ class Loop(Steps):
         # protect, plant: the supervisor tries the step without what disturbs it; the plant then takes it with
         past, units = self.plant.taken(units) if self.record.due(s.k) else (None, units)
         stands = ~(here.present & self.ours) | driven.stands
-        stands[[turn.train for turn in around.turns]] = True
+        if around.turns:
+            stands[[turn.train for turn in around.turns]] = True
 
         def over_the_step(ordered: Floats, disturbed: Disturbed, state: plant.State, calm: bool) -> plant.Moved:
             moved = self.plant.step(s.k, t, own, demand, ordered, formed, messages, state, disturbed, calm)
@@ -171,8 +168,8 @@ class Loop(Steps):
         # record, command and step
         watch = s.watch._replace(acting=acts)
         # Who comes back from where it was parked does so with the move, if it is let back: until then it is beside the track.
-        together = going._replace(parked=going.parked | s.traffic.parked).on_track(here)
-        told = moved.motion._replace(input=np.where(self.ours, moved.motion.input, np.nan))
+        together = s.traffic.on_track(going.on_track(here))
+        told = moved.motion if self.all_ours else moved.motion._replace(input=np.where(self.ours, moved.motion.input, np.nan))
         self.record.step(s.k, t, ways, together, seen, own, formed, demand, told, past, acting, watch)
         self.record.waits(t, together, speed, going, around, self.traffic.due(t, going), watch)
         for turn in around.turns:
@@ -296,6 +293,13 @@ class Loop(Steps):
         if p.has_units:
             self.topology, self.plant = topology.Topology(p, self.journal), plant.of(p, p.radio)
 
+    def _stop(self, going: traffic.State, before: traffic.State) -> None:
+        """Tell the world who parks and who stands, and who no longer does."""
+        for i in np.flatnonzero((going.parked != before.parked) & self.ours).tolist():
+            self.world.park(i, bool(going.parked[i]))
+        for i in np.flatnonzero((going.standing != before.standing) & ~(going.parked | before.parked) & self.ours).tolist():
+            self.world.halt(i, bool(going.standing[i]))
+
     def _climb(self, own: Floats, formed: Formed, ways: Any, here: Seen) -> None:
         """Tell the plant the slope of the net under every unit; that of a line it knows by the kilometrage."""
         if not self.p.net_slope.any():
@@ -327,11 +331,12 @@ class Loop(Steps):
             before = [line for i in wrong if (line := self._acted(i, own, demand, motion))]
             why = "; ".join(before) or "nothing was held, limited or saturated, so the law or its step diverged by itself"
             raise LawError(f"the state of train {names} is no longer finite after {t:g} s: {why}")
-        astray = np.flatnonzero(~(np.abs(moved.state.estimate) < ASTRAY).all(axis=1))
-        if len(astray):
+        estimate = moved.state.estimate
+        if estimate.size and not (np.abs(estimate) < ASTRAY).all():
+            astray = np.flatnonzero(~(np.abs(estimate) < ASTRAY).all(axis=1))
             names = ", ".join(dict.fromkeys(self.p.scenario.ids[i] for i in np.searchsorted(self.p.leading, astray, "right") - 1))
             raise LawError(f"the estimates of train {names} passed {ASTRAY:g} after {t:g} s: its observer diverged")
-        for i in np.flatnonzero(motion.clipped).tolist():
+        for i in motion.clipped.nonzero()[0].tolist():
             self.journal.event(t, "limit", train=self.p.scenario.ids[i], what="backwards", note="held at standstill")
 
     def _acted(self, i: int, own: Floats, demand: Demand, motion: Motion) -> str:

@@ -128,7 +128,7 @@ class Alarms:
             ("spacing_lower_m", links.lower, spacing < links.lower - ROUNDING),
             ("spacing_upper_m", links.upper, spacing > links.upper + ROUNDING),
         ):
-            for k in np.flatnonzero(violated & ahead).tolist():
+            for k in (violated & ahead).nonzero()[0].tolist():
                 yield _alarm(key, f"{ids[links.sender[k]]}-{ids[links.receiver[k]]}", float(spacing[k]), float(bound[k]))
 
     def _couplers(self, row: Row) -> Iterator[Alarm]:
@@ -140,7 +140,7 @@ class Alarms:
             ("coupler_lower_m", x.coupler_min, bounds.coupler_lower_m, x.coupler_min < bounds.coupler_lower_m),
             ("coupler_upper_m", x.coupler_max, bounds.coupler_upper_m, x.coupler_max > bounds.coupler_upper_m),
         ):
-            for u in np.flatnonzero(violated).tolist():
+            for u in violated.nonzero()[0].tolist():
                 i = int(np.searchsorted(p.consists.first, u, side="right")) - 1
                 yield _alarm(key, f"{p.scenario.ids[i]}.{p.unit[u]}", float(value[u]), bound)
 
@@ -203,5 +203,5 @@ class Alarms:
         return s.tally.outcome(self.p.supervision.mode == "on", more)
 
     def _per_train(self, key: str, value: Floats, bound: Floats, violated: Any) -> Iterator[Alarm]:
-        for i in np.flatnonzero(violated).tolist():
+        for i in violated.nonzero()[0].tolist():
             yield _alarm(key, self.p.scenario.ids[i], float(value[i]), float(bound[i]))

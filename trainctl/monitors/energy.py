@@ -42,8 +42,9 @@ class Balance:
     def __init__(self, p: Model) -> None:
         c = p.consists
         self.leading, self.units = c.first[:-1], np.diff(c.first)
-        self.inertia, self.stiffness, self.length = c.mass * c.rotating, c.stiffness.copy(), c.length
-        self.stiffness[c.first[1:] - 1] = 0.0  # no coupler behind the last unit
+        self.inertia, self.length = c.mass * c.rotating, c.length[:-1]
+        self.half_inertia, self.half_stiffness = 0.5 * self.inertia, 0.5 * c.stiffness[:-1]
+        self.half_stiffness[c.first[1:-1] - 1] = 0.0  # no coupler behind the last unit
         self.ours = ~p.roster.driven
 
     def initial(self) -> State:
@@ -53,9 +54,9 @@ class Balance:
 
     def energy(self, own: Floats) -> Floats:
         """Kinetic and coupler energy of every train [J], shape (n,)."""
-        each = 0.5 * self.inertia * own[:, SPEED] ** 2
-        stretch = own[:-1, POSITION] - own[1:, POSITION] - self.length[:-1]
-        each[:-1] += 0.5 * self.stiffness[:-1] * stretch**2
+        each = self.half_inertia * own[:, SPEED] ** 2
+        stretch = own[:-1, POSITION] - own[1:, POSITION] - self.length
+        each[:-1] += self.half_stiffness * stretch**2
         total: Floats = np.add.reduceat(each, self.leading)
         return total
 
@@ -65,12 +66,12 @@ class Balance:
             now = self.energy(row.own)
             accounted = row.extremes.energy @ SIGNS + s.kicked
             known = ~np.isnan(s.stored)  # neither the first row nor a train that has just come
-            s.drift[known] += (now - s.stored - accounted)[known]
+            np.add(s.drift, now - s.stored - accounted, out=s.drift, where=known)
             s.stored[:] = np.where(row.seen.present & self.ours, now, np.nan)
             s.kicked[:] = 0.0
-            s.turnover[known] += np.abs(row.extremes.energy).sum(axis=1)[known]
+            np.add(s.turnover, np.abs(row.extremes.energy).sum(axis=1), out=s.turnover, where=known)
             out = np.abs(s.drift) > self.LIMIT * s.turnover + ROUNDING * now
-            for i in np.flatnonzero(out).tolist():
+            for i in out.nonzero()[0].tolist():
                 yield i, float(s.drift[i] / max(s.turnover[i], ROUNDING * now[i], TINY_J))
         if row.disturbed is not None and row.disturbed.speed.any():
             kick = np.repeat(row.disturbed.speed, self.units)

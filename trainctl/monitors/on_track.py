@@ -119,7 +119,7 @@ class Watch:
         shown = self.track._replace(limit=in_force(self.signs, self.track.limit, t))
         limit, edge_of = limits(shown, ways, seen.row, seen.position, self.length, seen.present)
         limit = self.factor * limit
-        for i in np.flatnonzero(seen.present & (speed > limit + ROUNDING)).tolist():
+        for i in (seen.present & (speed > limit + ROUNDING)).nonzero()[0].tolist():
             yield {
                 "bound": LIMIT, "who": self.ids[i], "value": float(speed[i]), "limit": float(limit[i]),
                 "edge": self.line.edges[edge_of[i]],

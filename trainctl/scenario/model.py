@@ -145,7 +145,7 @@ class Model:
         """What the supervisor relies on of every train."""
         return promise.assume(self)
 
-    @property
+    @cached_property
     def leading(self) -> Ints:
         """Rows of the head units in per-unit arrays, shape (n,)."""
         return self.consists.first[:-1]

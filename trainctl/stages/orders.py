@@ -138,6 +138,8 @@ class Orders:
         Within a step it comes to a standstill at most: ``speed`` (n,) [m/s] is that of every train now.
         """
         found = np.full(len(speed), np.nan)
+        if not s.acting:
+            return found
         for number in s.acting:
             event = self._event(number, s)
             if event.kind == "brake":

@@ -144,6 +144,7 @@ class Units:
         run, top = p.scenario.run, p.scenario.topology
         self.step_s, self.sub_steps = run.step_s, run.sub_steps
         self.h = self.step_s / self.sub_steps
+        self.train = np.repeat(np.arange(len(p.leading)), np.diff(p.consists.first))  # (U,) of every unit
         self.law: Any = shared if p.sampled else p.law
         self.period = top.communication_period_s
         self.gradient = _slopes(p)
@@ -265,7 +266,7 @@ class Units:
             formed.links._replace(order=self.shares.order),
         )
         moved = own.copy()
-        moved[:, SPEED] += np.repeat(disturbed.speed, np.diff(first))
+        moved[:, SPEED] += disturbed.speed[self.train]
         began = moved.copy()
         limited, estimate, counted = state.extremes.limited.copy(), state.estimate.copy(), state.counted
         demanded = None
@@ -285,13 +286,13 @@ class Units:
         assert demanded is not None
         extras = self._extras(t, own, estimate, demanded, loop)
         force = own[:, FORCE].copy() if p.plant.STATES > FORCE else demanded
-        travelled = moved[leading, POSITION] - own[leading, POSITION]
+        front = own[leading, POSITION]
+        travelled = moved[leading, POSITION] - front
         asked = self._asked(began, moved, np.maximum(travelled, 0.0), calm)
         displacement = travelled + disturbed.position
         clipped = displacement < 0.0
         displacement[clipped] = 0.0
-        shift = np.repeat(own[leading, POSITION] + displacement - moved[leading, POSITION], np.diff(first))
-        moved[:, POSITION] += shift
+        moved[:, POSITION] += (front + displacement - moved[leading, POSITION])[self.train]
         mean = (moved[leading, SPEED] - own[leading, SPEED]) / self.step_s
         motion = Motion(
             displacement=displacement, input=np.add.reduceat(force, leading) / self.masses, acceleration=mean,
@@ -425,10 +426,9 @@ class Units:
 
     def _disturb(self, disturbed: Disturbed) -> None:
         """Hand this step's disturbing forces and resistance errors to the plant."""
-        units = np.diff(self.p.consists.first)
         table = self.plant.units
-        table[:, coupled_units.PUSH] = np.repeat(disturbed.input, units)
-        table[:, coupled_units.C0 : coupled_units.C2 + 1] = self.p.consists.davis * np.repeat(disturbed.resistance, units)[:, None]
+        table[:, coupled_units.PUSH] = disturbed.input[self.train]
+        table[:, coupled_units.C0 : coupled_units.C2 + 1] = self.p.consists.davis * disturbed.resistance[self.train, None]
 
 
 def copied(state: State) -> State:

@@ -41,7 +41,7 @@ class Slots:
     ) -> tuple[State, Formed, Floats, Seen, Links | None]:
         """Leave, join, sort; the links are None where nothing changed. See ``convoys.Convoys.step``."""
         track = self.track_of[seen.edge]
-        moved = np.flatnonzero(track != s.track)
+        moved = (track != s.track).nonzero()[0]
         names = self.p.line.track_ids
         for i in moved.tolist():
             self.journal.event(t, "leave", train=self.p.scenario.ids[i], track=names[s.track[i]])
@@ -64,7 +64,7 @@ class Slots:
         Returns the formations (n,), None where the set of members did not change.
         """
         formation = formed.formation
-        outside = np.flatnonzero(formation != track)
+        outside = (formation != track).nonzero()[0]
         if not len(outside):
             return None
         careful = getattr(self.p.law, "JOIN", "always") == "start_condition"

@@ -265,7 +265,7 @@ class Sumo(Session):
         A train that is where it should be, and not near the end of its edge, is on the edge it was on.
         """
         ways, row = self.ways, self.seen.row
-        there = np.flatnonzero(present)
+        there = present.nonzero()[0]
         begin = ways.begin[row]
         try:
             lane_position = self._lane_positions(there)
@@ -274,7 +274,7 @@ class Sumo(Session):
             raise
         position = wanted.copy()
         position[there] = begin[there] + lane_position
-        ask = np.flatnonzero(((left < NEAR_M) | ~(np.abs(position - wanted) <= TOLERANCE_M)) & present)
+        ask = (((left < NEAR_M) | ~(np.abs(position - wanted) <= TOLERANCE_M)) & present).nonzero()[0]
         if len(ask):
             row = row.copy()
             row[ask] = self._rows(ask)
@@ -384,9 +384,9 @@ class Sumo(Session):
         for train, edges, _ in self.turning:
             speeds[train] = (TURNS_M + self._inside(train, edges)) / step
         ours = present if self.box is None else present & ~self.box.obeyed.driven
-        self._call(self._command, np.flatnonzero(ours), speeds)
+        self._call(self._command, ours.nonzero()[0], speeds)
         if self.idle:
-            for i in np.flatnonzero(present & (left < PLANNED_M)).tolist():
+            for i in (present & (left < PLANNED_M)).nonzero()[0].tolist():
                 self._call(self._plan, self.ids[i], 0.0)
         if self.box is not None:
             self.box.hold()
@@ -402,7 +402,7 @@ class Sumo(Session):
             own, present = self.box.read(), present & ~self.box.obeyed.driven
         present = present & ~self._left(wanted, present)
         now = self._read(wanted, left, present)
-        wrong = np.flatnonzero(np.abs(now.position - wanted) > TOLERANCE_M)
+        wrong = (np.abs(now.position - wanted) > TOLERANCE_M).nonzero()[0]
         if len(wrong):
             raise CouplingError("; ".join(self._explain(int(i), now, before, displacement) for i in wrong[:5]))
         self._returned()

@@ -79,7 +79,7 @@ def in_order(order: Ints, position: Floats, track: Ints) -> bool:
     """Whether ``order`` still is that of positions and tracks."""
     p, t = position[order], track[order]
     same = t[1:] == t[:-1]
-    return bool(np.all(t[1:] >= t[:-1]) and not np.any(same & (p[1:] > p[:-1])))
+    return bool((t[1:] >= t[:-1]).all() and not (same & (p[1:] > p[:-1])).any())
 
 
 def pairs(plan: Plan, order: Ints, track: Ints) -> Ints:
