@@ -9,6 +9,7 @@ from typing import Any
 import nets
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 import tomli_w
 from beside import followed, plain
@@ -143,8 +144,8 @@ def test_metrics_count_late_stops_and_those_not_made(timetable):
 
 
 def test_shares_by_hand():
-    made = pd.DataFrame({
-        "train": ["a", "a", "b", "b", "c"], "number": [1, 2, 1, 2, 1], "planned_arrival_s": np.nan,
+    made = pa.table({
+        "train": ["a", "a", "b", "b", "c"], "number": [1, 2, 1, 2, 1], "planned_arrival_s": [np.nan] * 5,
         "planned_departure_s": [10.0, 20.0, 30.0, 900.0, 950.0], "delay_s": [0.0, 100.0, 200.0, np.nan, np.nan],
     })  # fmt: skip
     found = punctuality.of_stops(made, 1000.0)

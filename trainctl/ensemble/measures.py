@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
+import pyarrow as pa
 
 from trainctl.ensemble import count, units
 from trainctl.ensemble.count import Counts, Fixed, Pairs
@@ -101,11 +101,11 @@ def _listed(ids: tuple[str, ...], table: Floats) -> tuple[Floats, list[tuple[int
     sender, receiver, desired, lower, upper = table
     if not len(sender):
         return np.zeros((0, 5)), []
-    frame = pd.DataFrame({
-        "time_s": 0.0, "spacing_m": desired, "desired_m": desired, "lower_m": lower, "upper_m": upper,
+    links = pa.table({
+        "time_s": np.zeros(len(sender)), "spacing_m": desired, "desired_m": desired, "lower_m": lower, "upper_m": upper,
         "sender": [ids[i] for i in sender.astype(int).tolist()], "receiver": [ids[i] for i in receiver.astype(int).tolist()],
     })  # fmt: skip
-    listed = pairs(frame)
+    listed = pairs(links)
     place = {name: float(i) for i, name in enumerate(ids)}
     ends = np.array([(place[a], place[b]) for a, b in listed.ends]).reshape(-1, 2)
     number = {name: q for q, name in enumerate(listed.names)}

@@ -97,7 +97,7 @@ def _has(drawn: Drawn, name: str) -> bool:
         return bool(np.isfinite(drawn.trains.column("gap_m")).any())
     if name.endswith("_estimates"):
         columns = {"fault_estimates": "fault_estimate_mps3", "acceleration_estimates": "acceleration_estimate_mps2"}
-        return columns[name] in drawn.units.frame.columns and bool(np.isfinite(drawn.units.column(columns[name])).any())
+        return columns[name] in drawn.units.numbers and bool(np.isfinite(drawn.units.column(columns[name])).any())
     if name in ("couplers", "coupler_forces", "unit_differences"):
         if not drawn.units.names or not np.isfinite(drawn.units.column("coupler_m")).any():
             return False

@@ -70,7 +70,7 @@ def crossovers(run: Run, trains: Series) -> tuple[Place, ...]:
     low, high = float(position.min()), float(position.max())
     found = [c for c in line.crossovers if low <= c.start_m <= high]
     if len(found) > NAMED:
-        taken = set(trains.frame["edge"].astype(str).unique())
+        taken = set(trains.words["edge"].taken())
         found = [c for c in found if c.edge in taken]
     return tuple(Place(c.start_m, c.id, "crossover") for c in found)
 
@@ -85,7 +85,7 @@ def corridors(run: Run, trains: Series) -> tuple[list[Corridor], str]:
     trains : Series
         Its trains.
     """
-    edge = trains.frame["edge"].astype(str).to_numpy()
+    edge = trains.words["edge"].each()
     position = trains.column("position_m")
     net = run.net
     try:

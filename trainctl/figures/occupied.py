@@ -151,7 +151,7 @@ def along(distance: Floats) -> Floats:
 
 def travelled(drawn: Drawn, braking: dict[str, Floats], length: dict[str, float]) -> dict[str, Travelled]:
     """What every train ran over; empty where the run's net cannot be read or has no signals."""
-    edges, position = drawn.trains.frame["edge"].astype(str).to_numpy(), drawn.trains.column("position_m")
+    edges, position = drawn.trains.words["edge"].each(), drawn.trains.column("position_m")
     if drawn.run.net is None:
         return {}
     try:

@@ -58,7 +58,7 @@ def _on_tracks(drawn: Drawn) -> Figure:
     ways = {name: position[rows] for name, rows in drawn.trains.slices()}
     shown = ways if held.blocks else {name: relative[rows] for name, rows in drawn.trains.slices()}
     shades = _occupy(axes[0 if held.blocks else -1], held, shown, ways, drawn)
-    track = drawn.trains.frame["track"].astype(str).to_numpy()
+    track = drawn.trains.words["track"].each()
     tracks, switched = sorted(set(track), key=lambda name: (len(name), name)), False
     for (name, rows), label in zip(drawn.trains.slices(), style.labels(drawn.trains.names, "train "), strict=True):
         at, on = time[rows], track[rows]

@@ -91,8 +91,8 @@ class Drawn:
 
 def drawable(run: Run, width: str = "double", clock: bool = False, kmh: bool = False) -> Drawn:
     """Sort the tables of a run into series."""
-    units = series(run.units, "train", "unit")
-    return Drawn(run, facts(run), series(run.trains, "train"), pairs(run.links), units, width, clock, kmh)
+    units = series(run.rows("units", missing_is_empty=True), "train", "unit")
+    return Drawn(run, facts(run), series(run.rows("trains"), "train"), pairs(run.rows("links")), units, width, clock, kmh)
 
 
 def to_reference(drawn: Drawn) -> tuple[Floats, bool]:
@@ -317,8 +317,8 @@ def _distinct(ranges: Any) -> list[float]:
 
 def in_formation(drawn: Drawn) -> Bools:
     """True for rows of trains in a formation: as logged, else where they have a link; for all rows if no train ever has one."""
-    rows = drawn.trains.frame
-    if "in_formation" in rows:
+    rows = drawn.trains
+    if "in_formation" in rows.numbers:
         member: Bools = drawn.trains.column("in_formation") > 0.5
         return member
     if not drawn.links.names:

@@ -242,7 +242,7 @@ def _between_trains(panel: Axes, drawn: Drawn, column: str, scale: float) -> Non
 
 def _between_units(panel: Axes, drawn: Drawn, column: str) -> None:
     """Each unit minus the next one of its train."""
-    difference = np.full(len(drawn.units.frame), np.nan)
+    difference = np.full(len(drawn.units), np.nan)
     value, parts = drawn.units.column(column), drawn.units.slices()
     for (name, rows), (after, behind) in pairwise(parts):
         if name.rpartition(".")[0] == after.rpartition(".")[0] and rows.stop - rows.start == behind.stop - behind.start:

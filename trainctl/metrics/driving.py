@@ -82,7 +82,7 @@ def of_energy(trains: Series, units: Series, known: Facts, events: Sequence[Mapp
         return {}
     values: Values = {}
     suffix, turned = "", turns(trains, events)
-    if {"traction_j", "braking_j"} <= set(trains.frame.columns):
+    if {"traction_j", "braking_j"} <= set(trains.numbers):
         source = "integrated over the sub-steps"
         electric = trains.column("speed_mps") > ELECTRIC_BRAKE_FROM_MPS
         traction, braking = np.nan_to_num(trains.column("traction_j")), np.nan_to_num(trains.column("braking_j"))
@@ -107,7 +107,7 @@ def of_energy(trains: Series, units: Series, known: Facts, events: Sequence[Mapp
     if kilometres > 0:
         values["energy.traction_kwh_per_train_km"] = spent / kilometres
         values["energy.net_kwh_per_train_km"] = (spent - back) / kilometres
-    split = trains if len(traction) == len(trains.frame) else units
+    split = trains if len(traction) == len(trains) else units
     for item, rows in split.slices():
         values[f"energy.traction_kwh/{item}"] = float(traction[rows].sum()) / JOULES_PER_KWH
         values[f"energy.braking_kwh/{item}"] = float(braking[rows].sum()) / JOULES_PER_KWH

@@ -6,9 +6,10 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-import pandas as pd
+import pyarrow as pa
 
 from trainctl.metrics.values import Values
+from trainctl.runs.series import coded, in_numpy
 from trainctl.signals import Floats
 
 DEFINITIONS: dict[str, tuple[str, str]] = {
@@ -36,12 +37,14 @@ def of_entries(events: Iterable[Mapping[str, Any]]) -> Values:
     return _of("punctuality.entry_delay", np.array([float(e["delay_s"]) for e in events if e["kind"] == "depart"]))
 
 
-def of_stops(stops: pd.DataFrame, end: float) -> Values:
+def of_stops(stops: pa.Table, end: float) -> Values:
     """Delays against the timetable, from stops.parquet; the run ended at ``end`` [s]."""
-    if not len(stops):
+    if not stops.num_rows:
         return {}
-    plan = stops["planned_departure_s"].fillna(stops["planned_arrival_s"]).to_numpy()
-    delay = stops["delay_s"].to_numpy()
+    departure, arrival, delay, number = (
+        in_numpy(stops[name]) for name in ("planned_departure_s", "planned_arrival_s", "delay_s", "number")
+    )
+    plan = np.where(np.isnan(departure), arrival, departure)
     known, overdue = np.isfinite(delay), np.isnan(delay) & (plan < end)
     values = _of("punctuality.stop_delay", delay[known])
     counted = np.where(overdue, end - plan, delay)  # at least
@@ -50,9 +53,13 @@ def of_stops(stops: pd.DataFrame, end: float) -> Values:
             values[f"punctuality.stop_within_{limit}_s_share"] = float(np.mean(sure <= limit))
     if np.isfinite(plan).any():
         values["punctuality.stops_overdue"] = int(overdue.sum())
-    last = stops[known].sort_values(["train", "number"]).groupby("train", observed=True)["delay_s"].last()
-    values |= _of("punctuality.end_delay", last.to_numpy())
-    return values | {f"punctuality.end_delay_mean_s/{train}": float(late) for train, late in last.items()}
+    train = coded(stops["train"])
+    rows = np.lexsort((number, train.codes))
+    rows = rows[known[rows]]
+    last = rows[np.flatnonzero(np.append(np.diff(train.codes[rows]), 1))[: len(rows)]]  # of every train
+    values |= _of("punctuality.end_delay", delay[last])
+    late = zip(train.each()[last].tolist(), delay[last].tolist(), strict=True)
+    return values | {f"punctuality.end_delay_mean_s/{name}": seconds for name, seconds in late}
 
 
 def _of(name: str, delay: Floats) -> Values:

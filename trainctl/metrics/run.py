@@ -87,7 +87,7 @@ def metrics(run: Run, *, band_m: float = 1.0, speed_band: float = 0.02, section_
         See the module's head; numbers, None or text.
     """
     known = facts(run)
-    trains, links = series(run.trains, "train"), pairs(run.links)
+    trains, links = series(run.rows("trains"), "train"), pairs(run.rows("links"))
     time = trains.column("time_s") if trains.names else np.zeros(1)
     turned = turns(trains, run.events)
     values: Values = {
@@ -95,7 +95,7 @@ def metrics(run: Run, *, band_m: float = 1.0, speed_band: float = 0.02, section_
         "run.trains": len(trains.names),
         "run.train_km": sum(driving.distance(trains, rows, turned) for _, rows in trains.slices()) / 1000,
     }
-    units = series(run.units, "train", "unit")
+    units = series(run.rows("units", missing_is_empty=True), "train", "unit")
     values |= of_bounds(trains, units, links, known)
     values |= of_formation(links, windows(run, time.min()), band_m)
     values |= of_reference(trains, known, speed_band)
@@ -107,7 +107,7 @@ def metrics(run: Run, *, band_m: float = 1.0, speed_band: float = 0.02, section_
     inside = [float(event["value"]) for event in run.events if event["kind"] == "violation" and event.get("bound") == GAP]
     values |= traffic.of_trains(trains, section_m, inside, turned)
     values |= punctuality.of_entries(run.events)
-    values |= punctuality.of_stops(run.stops, float(time.max()))
+    values |= punctuality.of_stops(run.rows("stops", missing_is_empty=True), float(time.max()))
     try:
         values |= traffic.of_sumo(run.folder / "sumo")
     except InputError:
@@ -150,7 +150,7 @@ def of_bounds(trains: Series, units: Series, links: Series, known: Facts) -> Val
         if trains.names:
             lower, upper = np.repeat([limits.get(n, UNBOUNDED) for n in trains.names], np.diff(trains.first), axis=0).T
             value = trains.column(column)
-            if "in_formation" in trains.frame:  # a train alone is not driven by the law
+            if "in_formation" in trains.numbers:  # a train alone is not driven by the law
                 value = np.where(trains.column("in_formation") > 0.5, value, np.nan)
             margins(f"{name}_lower_margin_{unit}", trains, value - lower, f"lower {name} bound of train")
             margins(f"{name}_upper_margin_{unit}", trains, upper - value, f"upper {name} bound of train")
@@ -267,8 +267,8 @@ def nearest(links: Pairs) -> list[tuple[str, str, str]]:
 def of_watched(trains: Series) -> Values:
     """Extremes of what the law constrains: the columns ``<name>_min`` and ``<name>_max``."""
     values: Values = {}
-    for column in trains.frame.columns if trains.names else ():
+    for column in trains.numbers if trains.names else ():
         stem, _, end = column.rpartition("_")
-        if end in ("min", "max") and {f"{stem}_min", f"{stem}_max"} <= set(trains.frame.columns):
+        if end in ("min", "max") and {f"{stem}_min", f"{stem}_max"} <= set(trains.numbers):
             put_worst(values, f"watched.{column}", trains, trains.column(column), np.minimum if end == "min" else np.maximum)
     return values

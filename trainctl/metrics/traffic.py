@@ -8,15 +8,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from trainctl.errors import InputError
 from trainctl.metrics.values import Values, put_worst
-from trainctl.runs.logs import seconds, vehicles
 from trainctl.runs.series import INSTANT, Series
-from trainctl.runs.sumo_logs import elements, find_log
+from trainctl.runs.sumo_logs import elements, find_log, seconds
 from trainctl.signals import Bools, Floats
 
 #: Headways in time are counted for trains faster than this [m/s]: one at standstill has none.
@@ -110,12 +107,13 @@ def of_section(trains: Series, section_m: float | None, turned: Bools) -> Values
     values: Values = {"traffic.section_m": section_m, "traffic.passages": len(k)}
     if len(k):
         part = (section_m - position[k]) / (position[k + 1] - position[k])
-        passages = pd.DataFrame({"time_s": time[k] + part * (time[k + 1] - time[k]), "track": trains.frame["track"].to_numpy()[k]})
-        _rate(values, "traffic.trains_per_hour", passages["time_s"].to_numpy())
+        passed, track = time[k] + part * (time[k + 1] - time[k]), trains.words["track"]
+        _rate(values, "traffic.trains_per_hour", passed)
         shortest = []
-        for track, times in passages.groupby("track", observed=True)["time_s"]:
-            _rate(values, f"traffic.trains_per_hour/{track}", times.to_numpy())
-            shortest += list(np.diff(np.sort(times.to_numpy())))
+        for name in sorted(track._replace(codes=track.codes[k]).taken()):
+            times = passed[track.codes[k] == track.names.index(name)]
+            _rate(values, f"traffic.trains_per_hour/{name}", times)
+            shortest += list(np.diff(np.sort(times)))
         if shortest:
             values["traffic.passage_headway_min_s"] = float(min(shortest))
     return values
@@ -172,6 +170,8 @@ def metrics_of_fcd(path: Path | str) -> Values:
     InputError
         Not an FCD log, damaged, or with document types or entities in it.
     """
+    from trainctl.runs.logs import vehicles  # with pyarrow.compute, which takes long to import, and no run of ours needs
+
     return _of_rows(vehicles(Path(path)), Path(path), parked(Path(path)))
 
 
@@ -243,7 +243,7 @@ def _once(path: Path, time: Floats, ids: pa.ChunkedArray) -> None:
 
 def _on_lane(batch: pa.Table, parked: Mapping[str, Sequence[tuple[float, float]]]) -> pa.Table:
     """Rows of vehicles that are on a lane: one that is parked has left it."""
-    kept = np.asarray(pc.and_(batch["lane"].is_valid(), batch["pos"].is_valid()))
+    kept = np.asarray(batch["lane"].is_valid()) & np.asarray(batch["pos"].is_valid())
     if parked:
         time, name = batch["time"].to_numpy(), np.asarray(batch["id"].to_pylist(), dtype=object)
         for who, times in parked.items():

@@ -35,9 +35,9 @@ def at_least(split: Series, *columns: str) -> Floats:
 
 
 def _folded(split: Series, columns: tuple[str, ...], fold: np.ufunc) -> Floats:
-    out = np.full(len(split.frame), np.nan)
+    out = np.full(len(split), np.nan)
     for name in columns:
-        if name in split.frame.columns:
+        if name in split.numbers:
             value = split.column(name)
             out = fold(out, np.where(np.isfinite(value), value, np.nan))
     return out

@@ -252,6 +252,23 @@ def _verified(folder: Path, name: str, sums: Sequence[Sum]) -> None:
         verify(whole if len(sums) == 1 and not os.path.lexists(path) and whole.exists() else path, expected)
 
 
+# ``pa.array`` imports pandas, which takes longer than all else that pyarrow does in a short run: these do without.
+
+
+def _array(values: NDArray[Any], known: NDArray[np.bool_] | None = None) -> pa.Array:
+    """The same as an array of pyarrow's; values that are not ``known`` are missing."""
+    validity = None if known is None or known.all() else pa.py_buffer(np.packbits(known, bitorder="little"))
+    data = np.packbits(values, bitorder="little") if values.dtype == np.bool_ else values
+    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [validity, pa.py_buffer(data)])
+
+
+def _texts(names: Sequence[str]) -> pa.Array:
+    """An array of texts."""
+    encoded = [name.encode() for name in names]
+    ends = np.cumsum([0, *map(len, encoded)], dtype=np.int32)
+    return pa.StringArray.from_buffers(len(encoded), pa.py_buffer(ends), pa.py_buffer(b"".join(encoded)))
+
+
 class _Segments:
     """One table as a row of closed files ``<name>-<number>.parquet``; the one being written ends in ``.open``."""
 
@@ -352,7 +369,7 @@ class _Stream:
             name: np.empty(group_rows, dtype=_DTYPES[column] if isinstance(column, str) else np.int32)
             for name, column in columns.items()
         }
-        self.names = {name: pa.array(column, pa.string()) for name, column in columns.items() if not isinstance(column, str)}
+        self.names = {name: _texts(column) for name, column in columns.items() if not isinstance(column, str)}
         self.schema = pa.schema(
             [pa.field(name, pa.dictionary(pa.int32(), pa.string())) if name in self.names
              else pa.field(name, pa.from_numpy_dtype(buffer.dtype), nullable=False)  # a missing number is NaN; a third faster
@@ -404,9 +421,9 @@ class _Stream:
         for name, buffer in self.buffers.items():
             part = buffer[: self.filled]
             if name in self.names:
-                yield pa.DictionaryArray.from_arrays(pa.array(part, mask=part < 0), self.names[name])
+                yield pa.DictionaryArray.from_arrays(_array(part, part >= 0), self.names[name])
             else:
-                yield pa.array(part)
+                yield _array(part)
 
     def close(self) -> None:
         self.flush()

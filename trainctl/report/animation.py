@@ -41,7 +41,7 @@ def animation(drawn: Drawn) -> dict[str, Any]:
     if drawn.known.traffic:
         return _of_traffic(drawn)
     line = line_of(drawn.run)
-    categories = [str(name) for name in split.frame["track"].astype("category").cat.categories]
+    categories = split.words["track"].names
     tracks = list(line.track_ids) if line is not None and set(categories) <= set(line.track_ids) else categories
     instants = drawn.instants
     times = frames(instants, [float(event["time_s"]) for event in drawn.run.events], len(split.names))
@@ -117,12 +117,11 @@ def frames(instants: Floats, events: Sequence[float], trains: int) -> Floats:
 
 def _lateral(drawn: Drawn, line: Line | None, tracks: list[str]) -> Floats:
     """Lateral place of every row: the number of its track, in between on a crossover."""
-    frame = drawn.trains.frame
-    number = {name: float(k) for k, name in enumerate(tracks)}
-    side: Floats = np.array(frame["track"].astype(str).map(number), dtype=np.float64)
+    track, number = drawn.trains.words["track"], {name: float(k) for k, name in enumerate(tracks)}
+    side = np.array([*(number.get(name, np.nan) for name in track.names), np.nan])[track.codes]
     if line is None:
         return side
-    edge, x = frame["edge"].astype(str).to_numpy(), drawn.trains.column("position_m")
+    edge, x = drawn.trains.words["edge"].each(), drawn.trains.column("position_m")
     for over in line.crossovers:
         on = edge == over.edge
         if on.any() and over.from_track in number and over.to_track in number:

@@ -124,9 +124,8 @@ def _train_graph(drawn: Drawn) -> Iterator[Panel]:
     if drawn.known.traffic:
         yield from _corridors(drawn)
         return
-    track = drawn.trains.frame["track"]
-    tracks = sorted(map(str, track.unique()), key=natural)  # as in the figures
-    on = track.astype(str).to_numpy()
+    track = drawn.trains.words["track"]
+    tracks, on = sorted(track.taken(), key=natural), track.each()  # as in the figures
     reference = drawn.known.reference
     kinds = [("graph", "Train graph", "position [km]")]
     relative, crowd = to_reference(drawn)
@@ -401,10 +400,10 @@ def _of_units(drawn: Drawn, value: Floats, low: Floats, high: Floats, what: str)
 
 def _energy(drawn: Drawn) -> Iterator[Panel]:
     """Work at the wheel since the start, per train."""
-    frame, split = drawn.trains.frame, drawn.trains
+    split = drawn.trains
     time, count = split.column("time_s"), 2 * len(split.names)
     unit, note = "work [kWh]", "Traction full, braking dotted; at the wheel, integrated over the sub-steps."
-    if {"traction_j", "braking_j"} <= set(frame.columns):
+    if {"traction_j", "braking_j"} <= set(split.numbers):
         traction, braking = np.nan_to_num(split.column("traction_j")), np.nan_to_num(split.column("braking_j"))
     else:
         mass = {name: sum(row) for name, row in drawn.known.mass_kg.items()}

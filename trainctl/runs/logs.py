@@ -12,13 +12,10 @@ import pyarrow.compute as pc
 
 from trainctl.errors import InputError
 from trainctl.runs.kinds import KINDS, NAMES, Kind, kind_of_table
-from trainctl.runs.sumo_logs import decoded, elements, kind_of, opened
+from trainctl.runs.sumo_logs import decoded, elements, kind_of, opened, seconds
 from trainctl.runs.tables import csv_names, csv_rows, is_index, named, parquet_names, parquet_rows
 from trainctl.runs.xml_rows import xml_rows
 from trainctl.signals import Floats
-
-#: Seconds behind hours and minutes, and before them days.
-_CLOCK = re.compile(r"(-?)(?:(\d{1,9}):)?(\d{1,9}):(\d\d):(\d\d(?:\.\d+)?)")
 
 
 @dataclass(frozen=True)
@@ -188,23 +185,6 @@ def in_seconds(batch: pa.Table) -> pa.Table:
             texts = pa.array([None if text is None else seconds(text) for text in column.to_pylist()], pa.string())
             batch = batch.set_column(place, name, texts)
     return batch
-
-
-def seconds(text: str) -> str:
-    """Times like 1:00:00:02.50 or 00:00:02.50 in a text as seconds; the rest as it stands."""
-    if ":" not in text:
-        return text
-    words = text.split(" ")
-    found = [_CLOCK.fullmatch(word) for word in words]
-    if not any(found):
-        return text
-    return " ".join(word if clock is None else _told(clock) for word, clock in zip(words, found, strict=True))
-
-
-def _told(clock: re.Match[str]) -> str:
-    sign, days, hours, minutes, rest = clock.groups()
-    whole, dot, decimals = rest.partition(".")
-    return f"{sign}{((int(days or 0) * 24 + int(hours)) * 60 + int(minutes)) * 60 + int(whole)}{dot}{decimals}"
 
 
 def _xml_kind(path: Path) -> tuple[Kind | None, str | None]:

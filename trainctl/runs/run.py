@@ -11,9 +11,8 @@ import tomllib
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -22,6 +21,9 @@ from trainctl.errors import InputError
 from trainctl.record.folder import FORMAT, INFO, SCHEMA_VERSION
 from trainctl.runs.schema import INFO as FIELDS
 from trainctl.runs.schema import check_table, is_event, wrong_fields
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 #: run.json, metrics.json and scenario.toml are not longer than this [bytes], nor a line of events.jsonl.
 MOST_BYTES = 1 << 24
@@ -170,10 +172,15 @@ class Run:
 
     def table(self, table: str, missing_is_empty: bool = False) -> pd.DataFrame:
         """A whole table; names are categorical columns."""
+        whole: pd.DataFrame = self.rows(table, missing_is_empty).to_pandas()
+        return whole
+
+    def rows(self, table: str, missing_is_empty: bool = False) -> pa.Table:
+        """The same as it is in memory before it becomes a DataFrame: metrics do without pandas, which takes long to import."""
         files = self.files(table)
         if not files:
             if missing_is_empty:
-                return pd.DataFrame()
+                return pa.table({})
             raise InputError(f"{self.folder}: {table}.parquet is missing")
         parts = []
         for path in files:
@@ -188,8 +195,7 @@ class Run:
         except pa.ArrowException as error:
             raise InputError(f"{self.folder}: segments of {table} do not fit together: {_first_line(error)}") from None
         check_table(table, joined, self.folder)
-        whole: pd.DataFrame = joined.to_pandas()
-        return whole
+        return joined
 
 
 def _parquet(path: Path) -> pq.ParquetFile:

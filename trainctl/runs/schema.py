@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from trainctl.errors import InputError
+from trainctl.runs.series import coded, in_numpy
 
 #: Columns every table has, as the recorder writes them.
 KEYS = {"trains": ("train",), "units": ("train", "unit"), "links": ("sender", "receiver")}
@@ -54,16 +54,14 @@ def check_table(name: str, table: pa.Table, place: Path) -> None:
             wrong.append(f"{place}: {name}.{column!s:.60}: {rule}".replace("\n", " "))
     if wrong:
         raise InputError(wrong)
-    time = table["time_s"].to_numpy()
+    time = in_numpy(table["time_s"])
     new = np.diff(time) > 0
     if np.any(np.diff(time) < 0):
         raise InputError(f"{place}: {name}: time does not ascend")
     code = np.concatenate([[0], np.cumsum(new)]) if len(time) else np.zeros(0, np.int64)
     for key in KEYS[name]:
-        column = table[key].combine_chunks()
-        if key == "unit":
-            column = column.dictionary_encode()
-        code = code * (len(column.dictionary) + 1) + column.indices.to_numpy(zero_copy_only=False)
+        key_of = coded(table[key])
+        code = code * (len(key_of.names) + 1) + key_of.codes
     if np.any(np.diff(code) <= 0) and len(np.unique(code)) < len(code):
         twice = np.setdiff1d(np.arange(len(code)), np.unique(code, return_index=True)[1])[0]
         raise InputError(f"{place}: {name}: two rows of one {' and '.join(KEYS[name])} at {time[twice]:g} s")
@@ -87,11 +85,10 @@ def _column_rule(name: str, column: pa.ChunkedArray, is_key: bool) -> str | None
         return f"must be numbers, not {kind}"
     if column.null_count:
         return "a number is missing"
-    known = column.filter(pc.is_finite(column))
-    if name in STATES and len(known) < len(column):
+    known = (numbers := in_numpy(column))[np.isfinite(numbers)]  # pyarrow.compute takes long to import
+    if name in STATES and len(known) < len(numbers):
         return "a number is missing or not finite"
-    ends = pc.min_max(known)
-    if len(known) and max(abs(ends["min"].as_py()), abs(ends["max"].as_py())) > GREATEST:
+    if np.max(np.abs(known), initial=0.0) > GREATEST:
         return f"a number is beyond {GREATEST:g}"
     return None
 

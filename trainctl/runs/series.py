@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from trainctl.signals import Bools, Floats, Ints
@@ -16,21 +16,41 @@ from trainctl.signals import Bools, Floats, Ints
 INSTANT = 1e-6
 
 
+class Names(NamedTuple):
+    """A column of names, by numbers."""
+
+    codes: Ints  # (rows,) -1: missing
+    names: list[str]
+
+    def each(self) -> NDArray[np.object_]:
+        """The name in each row, "nan" where it is missing."""
+        return np.array([*self.names, "nan"], dtype=object)[self.codes]
+
+    def taken(self) -> list[str]:
+        """The names that some row has, in their order."""
+        return [self.names[code] for code in np.unique(self.codes).tolist() if code >= 0]
+
+
 @dataclass(frozen=True)
 class Series:
     """A table sorted by series, then time. Series ``k`` is the rows ``first[k]:first[k + 1]``."""
 
     names: list[str]
     first: Ints  # (len(names) + 1,)
-    frame: pd.DataFrame
+    numbers: Mapping[str, NDArray[Any]]  # columns (rows,)
+    words: Mapping[str, Names] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return int(self.first[-1])
 
     def column(self, name: str) -> Floats:
         """A column of all series, one after the other."""
-        return self.frame[name].to_numpy(dtype=np.float64)
+        return np.asarray(self.numbers[name], dtype=np.float64)
 
     def follows(self) -> Bools:
         """True where a row has a predecessor in its own series, shape (rows,)."""
-        out = np.ones(len(self.frame), dtype=np.bool_)
+        out = np.ones(len(self), dtype=np.bool_)
         out[self.first[:-1]] = False
         return out
 
@@ -43,38 +63,93 @@ class Series:
         return [(name, slice(int(a), int(b))) for name, a, b in zip(self.names, self.first[:-1], self.first[1:], strict=True)]
 
 
-def series(frame: pd.DataFrame, *keys: str) -> Series:
+def in_numpy(column: pa.ChunkedArray) -> NDArray[Any]:
+    """Numbers or truth values (rows,), not to be written into.
+
+    The same as ``column.to_numpy()``, which imports pandas and takes longer for that than all metrics of a short run.
+    """
+    plain = pa.types.is_floating(column.type) or pa.types.is_integer(column.type) or pa.types.is_boolean(column.type)
+    if not plain or column.null_count:
+        return column.to_numpy()  # type: ignore[no-any-return]
+    parts = [_values(part) for part in column.chunks]
+    return parts[0] if len(parts) == 1 else np.concatenate([np.zeros(0, _dtype(column.type)), *parts])
+
+
+def _values(part: pa.Array) -> NDArray[Any]:
+    rows, data = slice(part.offset, part.offset + len(part)), part.buffers()[1]
+    if data is None:
+        return np.zeros(0, _dtype(part.type))
+    if pa.types.is_boolean(part.type):
+        return np.unpackbits(np.frombuffer(data, np.uint8), bitorder="little")[rows].astype(np.bool_)
+    return np.frombuffer(data, _dtype(part.type))[rows]
+
+
+def _dtype(kind: pa.DataType) -> np.dtype[Any]:
+    """Numpy's type of numbers of pyarrow's: both call them by the same names but for these."""
+    return np.dtype({"float": "f4", "double": "f8"}.get(str(kind), str(kind)))
+
+
+def coded(column: pa.ChunkedArray) -> Names:
+    """A column of names; of numbers, their texts in ascending order."""
+    if not pa.types.is_dictionary(column.type):
+        return _numbered(np.array(column.to_pylist()) if pa.types.is_string(column.type) else in_numpy(column))
+    whole = column.combine_chunks()
+    codes = _values(whole.indices).astype(np.int64)
+    if whole.null_count:
+        codes[~np.asarray(whole.is_valid().to_pylist())] = -1
+    return Names(codes, [str(name) for name in whole.dictionary.to_pylist()])
+
+
+def _numbered(whole: NDArray[Any]) -> Names:
+    found, codes = np.unique(whole, return_inverse=True)
+    return Names(codes.astype(np.int64), [str(value) for value in found.tolist()])
+
+
+def series(table: pa.Table, *keys: str) -> Series:
     """Split a table by the values of ``keys`` (joined by a dot in the names) and sort each part by time."""
-    if frame.empty:
-        return Series([], np.zeros(1, dtype=np.int64), frame)
-    code = np.zeros(len(frame), dtype=np.int64)
-    texts: list[list[str]] = []
+    if not table.num_rows:
+        return Series([], np.zeros(1, dtype=np.int64), {})
+    numbers, words = dict[str, NDArray[Any]](), dict[str, Names]()
+    for name in table.column_names:
+        kind = table[name].type
+        if pa.types.is_dictionary(kind) or pa.types.is_string(kind):
+            words[name] = coded(table[name])
+        else:
+            numbers[name] = in_numpy(table[name])
+    return _split(numbers, words, [words[key] if key in words else coded(table[key]) for key in keys])
+
+
+def _split(numbers: Mapping[str, NDArray[Any]], words: Mapping[str, Names], keys: Sequence[Names]) -> Series:
+    """Columns, one row or more, as one series for each combination of ``keys``."""
+    code = np.zeros(len(numbers["time_s"]), dtype=np.int64)
     for key in keys:
-        column = frame[key].astype("category") if not isinstance(frame[key].dtype, pd.CategoricalDtype) else frame[key]
-        code = code * (len(column.cat.categories) + 1) + column.cat.codes.to_numpy()
-        texts.append([str(text) for text in column.cat.categories] + ["?"])
-    order = np.lexsort((frame["time_s"].to_numpy(), code))
+        code = code * (len(key.names) + 1) + key.codes
+    order = np.lexsort((numbers["time_s"], code))
     code = code[order]
     first = np.concatenate([[0], np.flatnonzero(np.diff(code)) + 1, [len(code)]]).astype(np.int64)
     names = []
     for value in code[first[:-1]]:
         parts = []
-        for text in reversed(texts):
-            value, part = divmod(int(value), len(text))
-            parts.append(text[part])
+        for key in reversed(keys):
+            value, part = divmod(int(value), len(key.names) + 1)
+            parts.append([*key.names, "?"][part])
         names.append(".".join(reversed(parts)))
-    return Series(names, first, frame.iloc[order])
+    return Series(
+        names, first, {name: column[order] for name, column in numbers.items()},
+        {name: column._replace(codes=column.codes[order]) for name, column in words.items()},
+    )  # fmt: skip
 
 
 def turns(split: Series, events: Iterable[Mapping[str, Any]]) -> Bools:
     """Rows after which a train turned back before its next one, shape (rows,): there its positions begin anew."""
-    found, time = np.zeros(len(split.frame), dtype=np.bool_), split.column("time_s") if split.names else np.zeros(0)
+    found, time = np.zeros(len(split), dtype=np.bool_), split.column("time_s") if split.names else np.zeros(0)
     told: dict[str, list[float]] = {}
     for event in events:
         if event["kind"] == "turn":
             told.setdefault(str(event["train"]), []).append(float(event["time_s"]))
+    train = split.words["train"].each() if told and split.names else np.zeros(0)
     for _, rows in split.slices() if told else ():
-        for at in told.get(str(split.frame["train"].iloc[rows.start]), ()):
+        for at in told.get(train[rows.start], ()):
             k = rows.start + int(np.searchsorted(time[rows], at + INSTANT, side="right")) - 1
             if rows.start <= k < rows.stop - 1:
                 found[k] = True
@@ -96,41 +171,40 @@ class Pairs(Series):
     ends: list[tuple[str, str]] = field(default_factory=list)
 
 
-def pairs(links: pd.DataFrame) -> Pairs:
+def pairs(links: pa.Table) -> Pairs:
     """Links as one series per pair ``ahead-behind``, whichever receives from which.
 
     A pair that receives from each other stands twice in the log with opposite signs; here the train that is to be ahead comes first
     and the tighter bound of both rows counts. Columns: ``time_s, spacing_m, desired_m, lower_m, upper_m, error_m`` and
     ``age_s``, the time since the link was made or its desired spacing or bounds were changed.
     """
-    if links.empty:
-        return Pairs([], np.zeros(1, dtype=np.int64), links)
-    flip = links["desired_m"].to_numpy() < 0
+    if not links.num_rows:
+        return Pairs([], np.zeros(1, dtype=np.int64), {})
+    stated = {name: in_numpy(links[name]) for name in ("time_s", "spacing_m", "desired_m", "lower_m", "upper_m")}
+    flip = stated["desired_m"] < 0
     sign = np.where(flip, -1.0, 1.0)
-    ends = [links[key].astype("category").cat for key in ("sender", "receiver")]
-    names = sorted({str(text) for end in ends for text in end.categories})
+    ends = [coded(links[key]) for key in ("sender", "receiver")]
+    names = sorted({text for end in ends for text in end.names})
     place = {text: code for code, text in enumerate(names)}
-    sender, receiver = (np.array([place[str(text)] for text in end.categories])[end.codes.to_numpy()] for end in ends)
-    lower, upper = links["lower_m"].to_numpy(), links["upper_m"].to_numpy()
-    frame = pd.DataFrame({
-        "time_s": links["time_s"].to_numpy(),
-        "pair": np.where(flip, receiver, sender) * len(names) + np.where(flip, sender, receiver),
-        "spacing_m": sign * links["spacing_m"].to_numpy(),
-        "desired_m": sign * links["desired_m"].to_numpy(),
-        "lower_m": np.where(flip, -upper, lower),
-        "upper_m": np.where(flip, -lower, upper),
-    })  # fmt: skip
-    split = series(frame, "pair")
+    sender, receiver = (np.array([place[text] for text in end.names])[end.codes] for end in ends)
+    pair = np.where(flip, receiver, sender) * len(names) + np.where(flip, sender, receiver)
+    split = _split({
+        "time_s": stated["time_s"],
+        "spacing_m": sign * stated["spacing_m"],
+        "desired_m": sign * stated["desired_m"],
+        "lower_m": np.where(flip, -stated["upper_m"], stated["lower_m"]),
+        "upper_m": np.where(flip, -stated["lower_m"], stated["upper_m"]),
+    }, {}, [_numbered(pair)])  # fmt: skip
     time, label = split.column("time_s"), split.labels()
     start = np.flatnonzero(np.concatenate([[True], (np.diff(time) > INSTANT) | (np.diff(label) > 0)]))
-    single = split.frame.iloc[start].copy()
+    single = {name: split.column(name)[start] for name in ("time_s", "spacing_m", "desired_m")}
     single["lower_m"] = np.maximum.reduceat(split.column("lower_m"), start)
     single["upper_m"] = np.minimum.reduceat(split.column("upper_m"), start)
     single["error_m"] = single["spacing_m"] - single["desired_m"]
     first = np.searchsorted(label[start], np.arange(len(split.names) + 1))
     ends_of = [(names[int(pair) // len(names)], names[int(pair) % len(names)]) for pair in split.names]
-    out = Pairs([f"{a}-{b}" for a, b in ends_of], first.astype(np.int64), single, ends_of)
-    single["age_s"] = out.column("time_s") - _since(out, links["time_s"].to_numpy())
+    out = Pairs([f"{a}-{b}" for a, b in ends_of], first.astype(np.int64), single, ends=ends_of)
+    single["age_s"] = out.column("time_s") - _since(out, stated["time_s"])
     return out
 
 

@@ -242,3 +242,24 @@ def ended(path: Path) -> bool:
         file.seek(-min(path.stat().st_size, 200), os.SEEK_END)
         end = file.read()
     return end.endswith(b"PAR1") if path.suffix == ".parquet" else re.search(rb"(</[\w-]+>|/>)\s*$", end) is not None
+
+
+#: Seconds behind hours and minutes, and before them days.
+_CLOCK = re.compile(r"(-?)(?:(\d{1,9}):)?(\d{1,9}):(\d\d):(\d\d(?:\.\d+)?)")
+
+
+def seconds(text: str) -> str:
+    """Times like 1:00:00:02.50 or 00:00:02.50 in a text as seconds; the rest as it stands."""
+    if ":" not in text:
+        return text
+    words = text.split(" ")
+    found = [_CLOCK.fullmatch(word) for word in words]
+    if not any(found):
+        return text
+    return " ".join(word if clock is None else _told(clock) for word, clock in zip(words, found, strict=True))
+
+
+def _told(clock: re.Match[str]) -> str:
+    sign, days, hours, minutes, rest = clock.groups()
+    whole, dot, decimals = rest.partition(".")
+    return f"{sign}{((int(days or 0) * 24 + int(hours)) * 60 + int(minutes)) * 60 + int(whole)}{dot}{decimals}"

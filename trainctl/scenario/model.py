@@ -83,7 +83,7 @@ class Model:
         """Whether trains may be given other routes than they begin with."""
         return any(event.kind == "reroute" for event in self.scenario.event) or bool(self.roster.closings or self.roster.choices)
 
-    @property
+    @cached_property
     def braked(self) -> bool:
         """Whether trains may be ordered to brake."""
         return any(event.kind == "brake" for event in self.scenario.event)

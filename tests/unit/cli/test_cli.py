@@ -212,3 +212,15 @@ def test_help_says_where_a_laws_file_is_executed(command, monkeypatch, capsys):
     with pytest.raises(SystemExit):
         cli.main()
     assert "A law that is a file is a program: it is executed." in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_run_imports_no_more_than_it_needs(tmp_path):
+    """What only figures, other files or other laws need takes longer to import than the metrics of a short run."""
+    code = (
+        "import sys; from trainctl.cli import program\n"
+        f"sys.argv = ['trainctl', 'run', '--backend', 'numeric', '--set', 'run.duration_s=8', '--quiet', '--out', {str(tmp_path / 'r')!r}]\n"
+        "try: program.main()\n"
+        "finally: print(sorted({'pandas', 'pyarrow.compute', 'scipy.linalg', 'scipy.sparse', 'matplotlib', 'dask'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -40,7 +40,7 @@ def test_both_tracks_and_both_platforms_are_one_corridor(terminal):
     (only,), more = corridors(terminal, drawn.trains)
     assert more == "" and set(only.distance) == {"t0", "t1", "t2"}
     for train, rows in drawn.trains.slices():
-        at, edge = only.distance[train], drawn.trains.frame["edge"].astype(str).to_numpy()[rows]
+        at, edge = only.distance[train], drawn.trains.words["edge"].each()[rows]
         jumps = np.abs(np.diff(at))
         assert np.isfinite(at).all() and jumps.max() < 101.0 and np.sum(jumps > 40.0) <= 1  # it turns: its rear is its front
         there, back = (np.sign(np.diff(at)[edge[1:] == name]) for name in ("up", "down"))

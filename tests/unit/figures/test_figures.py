@@ -194,9 +194,11 @@ def test_events_stand_in_every_panel_over_time(tmp_path: Path) -> None:
 
 def test_couplers_at_rest_have_no_figure(tmp_path: Path) -> None:
     run = made_up(tmp_path, "emu_finite_time", units=2)
-    assert "coupler_forces" in applicable(drawable(run))
-    run.units[["coupler_m", "coupler_force_n"]] *= 1e-9  # rounding
-    assert not {"couplers", "coupler_forces"} & set(applicable(drawable(run)))
+    drawn = drawable(run)
+    assert "coupler_forces" in applicable(drawn)
+    for name in ("coupler_m", "coupler_force_n"):
+        drawn.units.column(name)[:] *= 1e-9  # rounding
+    assert not {"couplers", "coupler_forces"} & set(applicable(drawn))
 
 
 def test_hours_and_kilometres_per_hour_by_option(tmp_path: Path) -> None:
