@@ -343,7 +343,7 @@ class Model:
         scenario = self.scenario.model_copy(update={"train": tuple(self.scenario.train[i] for i in members)})
         scenario.__dict__.pop("ids", None)
         found = copy.copy(self)
-        for known in ("first_scene", "sure_braking", "unit"):
+        for known in ("first_scene", "leading", "sure_braking", "unit"):
             found.__dict__.pop(known, None)
         found.__dict__.update(
             scenario=scenario, consists=Consists(first, *of_units), own=self.own[units], roster=roster._replace(**arrays, **tuples),
