@@ -136,9 +136,16 @@ class Line:
 
     def route(self, track: str, position_m: float) -> tuple[str, ...]:
         """Edges from a place to the end of the line, on the same track."""
-        first, starts = self._on(track)
         k, _ = self.locate(track, position_m)
-        return self.edges[k : first + len(starts)]
+        if k not in self._onward:
+            first, starts = self._on(track)
+            self._onward[k] = self.edges[k : first + len(starts)]
+        return self._onward[k]
+
+    @cached_property
+    def _onward(self) -> dict[int, tuple[str, ...]]:
+        """Routes that have been asked for, by their first edge: trains by the thousand start on the same few."""
+        return {}
 
     def route_over(self, current_edge: str, crossover_id: str) -> tuple[str, ...]:
         """Edges from the current one over a crossover to the end of the line on the track it leads to.

@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from trainctl.kernels import keep_by_sources
+from trainctl.kernels import bare, keep_by_sources
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -164,7 +164,9 @@ class References(NamedTuple):
             out = np.empty(4)
             evaluate(self.breaks[0], self.position[0], t, t, out)
             return out
-        return _leaders(self, t)
+        each, out = np.empty((len(self.breaks), 4)), np.empty((4, len(self.of)))
+        _leaders(self, t, each, out)
+        return out
 
 
 @njit(cache=True)
@@ -173,29 +175,35 @@ def evaluate(breaks: Floats, position: Floats, t: float, inside: float, out: Flo
 
     ``inside`` is any time within the piece meant: at a break the two sides differ, and an integrator's step must see one.
     """
-    k = min(max(np.searchsorted(breaks, inside, side="right") - 1, 0), position.shape[0] - 1)
+    pieces, k = position.shape[0], 0
+    if pieces > 1:
+        k = min(max(np.searchsorted(breaks, inside, side="right") - 1, 0), pieces - 1)
     s = t - breaks[k]
-    for d in range(4):
-        value = 0.0
-        for p in range(position.shape[1] - 1, d - 1, -1):
-            factor = position[k, p]
-            for q in range(d):
-                factor *= p - q
-            value = value * s + factor
-        out[d] = value
+    x = v = a = jerk = 0.0
+    for p in range(position.shape[1] - 1, -1, -1):
+        factor = position[k, p]
+        x = x * s + factor
+        if p > 0:
+            factor *= p
+            v = v * s + factor
+        if p > 1:
+            factor *= p - 1
+            a = a * s + factor
+        if p > 2:
+            factor *= p - 2
+            jerk = jerk * s + factor
+    out[0], out[1], out[2], out[3] = x, v, a, jerk
 
 
-@njit(cache=True)
-def _leaders(references: References, t: float) -> Floats:
-    """Position, speed, acceleration and jerk of every train's reference at ``t``, shape (4, n)."""
-    each = np.empty((len(references.breaks), 4))
+@bare
+def _leaders(references: References, t: float, each: Floats, out: Floats) -> None:
+    """Write position, speed, acceleration and jerk at ``t`` of every reference (R, 4), and of every train's (4, n)."""
+    of = references.of
     for r in range(len(each)):
         evaluate(references.breaks[r], references.position[r], t, t, each[r])
-    out = np.empty((4, len(references.of)))
-    for i in range(len(references.of)):
-        for d in range(4):
-            out[d, i] = each[references.of[i], d]
-    return out
+    for d in range(4):
+        for i in range(len(of)):
+            out[d, i] = each[of[i], d]
 
 
 @njit(cache=True)

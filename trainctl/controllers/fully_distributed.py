@@ -45,12 +45,12 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
-from numba import njit
 from pydantic import Field
 
 from trainctl.contracts import SampledLaw
 from trainctl.controllers import stated
 from trainctl.davis import resistance, resistance_of
+from trainctl.kernels import bare
 from trainctl.signals import POSITION, SPEED, Bools, Demand, Floats, Links, Reference, Scene, Table, Trains, leader_at
 
 if TYPE_CHECKING:
@@ -126,8 +126,11 @@ def message(constants: Constants, own: Trains, leader: Floats) -> Floats:
 
     In the moving frame a message that comes late is off by what its sender has moved against the formation, not by v_r T.
     """
-    z = own.position + (1.0 - constants.theta) * own.speed * constants.period - leader[POSITION]
-    return np.expand_dims(z, 1)
+    z = (1.0 - constants.theta) * own.speed
+    z *= constants.period
+    z += own.position
+    z -= leader[POSITION]
+    return z[:, None]
 
 
 def demand(constants: Constants, own: Trains, leader: Floats, links: Links, heard: Floats) -> Demand:
@@ -157,19 +160,19 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
     """
     n = len(own.speed)
     acceleration, saturated = np.empty(n), np.empty(n, dtype=bool)
-    z, speed = message(constants, own, leader)[:, 0].copy(), np.ascontiguousarray(own.speed)
+    z, speed = message(constants, own, leader)[:, 0], np.ascontiguousarray(own.speed)
     believed, came = np.ascontiguousarray(own.resistance), np.ascontiguousarray(heard[:, 0])
-    wanted = np.ascontiguousarray(np.broadcast_to(leader[SPEED], n))  # formations that come and go have references of their own
+    wanted = leader[SPEED] if leader.ndim > 1 else np.full(n, leader[SPEED])  # formations may have references of their own
     _admitted(constants, z, speed, believed, came, wanted, links, acceleration, saturated)
     return Demand(acceleration, saturated)
 
 
-@njit(cache=True, error_model="numpy")
+@bare(error_model="numpy")
 def _admitted(
     constants: Constants, z: Floats, speed: Floats, believed: Floats, heard: Floats, reference: Floats, links: Links,
     acceleration: Floats, saturated: Bools,
 ) -> None:  # fmt: skip
-    """Write what (10) to (12) give every train. ``np.minimum`` and ``np.maximum`` pass on what is not a number."""
+    """Write what (10) to (12) give every train. What is not a number is passed on: a message's by G, a train's own by its speed."""
     c, T = constants, constants.period
     for i in range(len(z)):
         alpha, Alpha, total, hold = -np.inf, np.inf, 0.0, False
@@ -181,8 +184,8 @@ def _admitted(
             else:
                 hold = True
             if c.ratchet:
-                gamma, Gamma = np.minimum(gamma, z_ji), np.maximum(Gamma, z_ji)
-            alpha, Alpha = np.maximum(alpha, (z_ji - Gamma) / 2), np.minimum(Alpha, (z_ji - gamma) / 2)
+                gamma, Gamma = min(gamma, z_ji), max(Gamma, z_ji)
+            alpha, Alpha = max(alpha, (z_ji - Gamma) / 2), min(Alpha, (z_ji - gamma) / 2)
             total += z_ji - links.desired[k]
         G = total / (2 * (end - begin)) if end > begin else 0.0
 
@@ -198,8 +201,8 @@ def _admitted(
         else:
             eta = c.Rho[i] * T + (c.mu[i] - c.f[i]) * (T * T) - v_r * T
             Eta = c.rho[i] * T + (c.Mu[i] - c.F[i]) * (T * T) - v_r * T
-        delta, Delta = np.maximum(alpha, np.maximum(beta, eta)), np.minimum(Alpha, np.minimum(Beta, Eta))
-        s = Delta if Delta <= G else np.maximum(G, delta)
+        delta, Delta = max(alpha, max(beta, eta)), min(Alpha, min(Beta, Eta))
+        s = Delta if Delta <= G else max(G, delta)
         saturated[i] = s != G and not hold
         if hold:
             s = 0.0

@@ -8,9 +8,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from trainctl.kernels import keep_by_sources
+from trainctl.kernels import bare, keep_by_sources
 from trainctl.metrics.driving import ELECTRIC_BRAKE_FROM_MPS
 from trainctl.metrics.run import SLACK
 from trainctl.metrics.traffic import MOVING_MPS
@@ -66,18 +65,42 @@ class Fixed(NamedTuple):
     band: float  # m, within which a spacing has settled
 
 
-class Instant(NamedTuple):
-    """What a recorded instant is among the others."""
+class Instants(NamedTuple):
+    """The recorded instants, (K,) each: what each is among the others."""
 
-    t: float  # s
-    dt: float  # s, since the one before; NaN: none
-    middle: float  # s, between the middles of the two steps to it; NaN: none
-    counts: bool  # links are old enough for their bounds to count
-    reference: float  # m/s
-    level: bool  # the reference keeps its speed
-    fresh: bool  # the first instant of that speed
-    number: int
-    last: bool
+    t: Floats  # s
+    dt: Floats  # s, since the one before; NaN: none
+    middle: Floats  # s, between the middles of the two steps to it; NaN: none
+    counts: Bools  # links are old enough for their bounds to count
+    reference: Floats  # m/s
+    level: Bools  # the reference keeps its speed
+    fresh: Bools  # the first instant of that speed
+
+
+class Passage(NamedTuple):
+    """Some steps one after the other, M of them, counted together: train by train, each with what was counted of it at hand."""
+
+    position: Floats  # (M, N) m
+    speed: Floats  # (M, N) m/s
+    force: Floats  # (M, N) m/s2, applied from then on
+    saturated: Bools  # (M, N)
+    moves: Bools  # (M,) ``force`` counts; not at the end
+    number: Ints  # (M,) of the recorded instant, -1: it is none
+
+    @classmethod
+    def empty(cls, steps: int, trains: int) -> Passage:
+        """Room for so many steps."""
+        position, speed, force = np.empty((3, steps, trains))
+        return cls(position, speed, force, np.empty((steps, trains), bool), np.empty(steps, bool), np.empty(steps, np.int64))
+
+    def write(
+        self, row: int, position: Floats, speed: Floats, force: Floats | None, saturated: Bools, number: int
+    ) -> None:  # fmt: skip
+        """Write a step; ``force`` is None at the end."""
+        self.position[row], self.speed[row], self.saturated[row] = position, speed, saturated
+        self.moves[row], self.number[row] = force is not None, number
+        if force is not None:
+            self.force[row] = force
 
 
 class Counts(NamedTuple):
@@ -105,131 +128,134 @@ def nothing(fixed: Fixed, runs: int) -> Counts:
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
-def watch(fixed: Fixed, position: Floats, speed: Floats, force: Floats, moves: bool, counts: Counts) -> None:
-    """Which bounds are violated at an instant, and which runs cannot go on here.
+@bare(error_model="numpy")
+def count(fixed: Fixed, instants: Instants, passage: Passage, steps: int, counts: Counts) -> None:
+    """Which bounds are violated, which runs cannot go on here, and what metrics are made of.
 
     Parameters
     ----------
     fixed : Fixed
         The trains.
-    position, speed, force : ndarray, shape (N,)
-        Now [m], [m/s], [m/s2].
-    moves : bool
-        ``force`` is applied from now on; not at the end.
+    instants : Instants
+        The recorded ones.
+    passage : Passage
+        What is counted, after all that came before.
+    steps : int
+        How many rows of it, from the first on.
     counts : Counts
         Updated.
     """
-    kept = fixed.kept
-    for i in range(len(position)):
-        x, v = position[i], speed[i]
-        bits = 0
-        if v < kept.speed_lower[i] - ROUNDING:
-            bits |= SLOW
-        if v > kept.speed_upper[i] + ROUNDING:
-            bits |= FAST
-        if moves:
-            if force[i] < kept.input_lower[i] - ROUNDING:
-                bits |= BRAKES
-            if force[i] > kept.input_upper[i] + ROUNDING:
-                bits |= PULLS
-        if bits:
-            counts.violated[i] |= bits
-        if not (abs(x) < np.inf and abs(v) < np.inf):
-            counts.fate[fixed.run[i]] = NOT_FINITE
-        j = fixed.ahead[i]
-        if j >= 0 and not position[j] - fixed.length[j] - x > TOUCH_M:
-            counts.fate[fixed.run[i]] = max(counts.fate[fixed.run[i]], TOUCHES)
-    links = fixed.links
-    for k in range(len(links.sender)):
-        spacing = position[links.sender[k]] - position[links.receiver[k]]
-        if spacing > 0.0:  # each pair once
-            if spacing < links.lower[k] - ROUNDING:
-                counts.link[k] |= NEAR
-            if spacing > links.upper[k] + ROUNDING:
-                counts.link[k] |= FAR
-
-
-@njit(cache=True, error_model="numpy")
-def count(
-    fixed: Fixed, now: Instant, position: Floats, speed: Floats, force: Floats, saturated: Bools, counts: Counts
-) -> None:  # fmt: skip
-    """Count a recorded instant; arguments as of ``watch``, ``saturated`` (N,)."""
-    known, first = fixed.known, now.number == 0
-    jerky = now.middle == now.middle
-    for i in range(len(position)):
-        c = counts.train[i]
-        x, v = position[i], speed[i]
-        if first:
-            c[START] = x
-        else:
-            acceleration = (v - c[SPEED]) / now.dt
-            c[ACCELERATION_MIN] = min(c[ACCELERATION_MIN], acceleration)
-            c[ACCELERATION_MAX] = max(c[ACCELERATION_MAX], acceleration)
-            if jerky:
-                jerk = abs((acceleration - c[ACCELERATION]) / now.middle)
-                c[JERK_MAX] = max(c[JERK_MAX], jerk)
-                c[JERK_SUM] += jerk * jerk * now.middle
-            c[ACCELERATION] = acceleration
-            work = c[INPUT] * fixed.mass[i] * (x - c[POSITION])
-            if work > 0.0:
-                c[TRACTION] += work
+    known, kept, seen = fixed.known, fixed.kept, passage
+    for i in range(seen.position.shape[1]):
+        c, run, j = counts.train[i], fixed.run[i], fixed.ahead[i]
+        bits, fate = 0, GOES_ON
+        for k in range(steps):
+            x, v, u, moves, number = seen.position[k, i], seen.speed[k, i], seen.force[k, i], seen.moves[k], seen.number[k]
+            if v < kept.speed_lower[i] - ROUNDING:
+                bits |= SLOW
+            if v > kept.speed_upper[i] + ROUNDING:
+                bits |= FAST
+            if moves:
+                if u < kept.input_lower[i] - ROUNDING:
+                    bits |= BRAKES
+                if u > kept.input_upper[i] + ROUNDING:
+                    bits |= PULLS
+            if not (abs(x) < np.inf and abs(v) < np.inf):
+                fate = NOT_FINITE
+            if j >= 0 and not seen.position[k, j] - fixed.length[j] - x > TOUCH_M:
+                fate = max(fate, TOUCHES)
+            if number < 0:
+                continue
+            if number == 0:
+                c[START] = x
             else:
-                c[BRAKING] -= work
-                if c[SPEED] > ELECTRIC_BRAKE_FROM_MPS:
-                    c[ELECTRIC] -= work
-        c[POSITION], c[SPEED] = x, v
-        c[SPEED_MIN], c[SPEED_MAX] = min(c[SPEED_MIN], v), max(c[SPEED_MAX], v)
-        c[SPEED_SUM] += v
-        violated = v - known.speed_lower[i] < -SLACK or known.speed_upper[i] - v < -SLACK
-        if not now.last:
-            u = force[i]
-            c[INPUT] = u
-            c[INPUT_MIN], c[INPUT_MAX] = min(c[INPUT_MIN], u), max(c[INPUT_MAX], u)
-            violated = violated or u - known.input_lower[i] < -SLACK or known.input_upper[i] - u < -SLACK
-        if violated and not counts.first[fixed.run[i]] <= now.t:
-            counts.first[fixed.run[i]] = now.t
-        if saturated[i]:
-            c[SATURATED] += 1.0
-        j = fixed.ahead[i]
-        if j >= 0:
-            spacing = position[j] - x
-            c[SPACING_MIN] = min(c[SPACING_MIN], spacing)
-            c[SPACING_SUM] += spacing
-            if v > MOVING_MPS:
-                headway = spacing / v
-                c[HEADWAY_MIN] = min(c[HEADWAY_MIN], headway)
-                c[HEADWAY_SUM] += headway
-                c[HEADWAYS] += 1.0
-        error = v - now.reference
-        c[SPEED_ERROR] = abs(error)
-        if now.level:
-            if now.fresh:
-                c[SIDE] = error
-            beyond = abs(error) if c[SIDE] == 0.0 else (-error if c[SIDE] > 0.0 else error)
-            c[OVERSHOOT] = max(c[OVERSHOOT], beyond)
-    _pairs(fixed, now, position, counts)
+                dt, middle = instants.dt[number], instants.middle[number]
+                acceleration = (v - c[SPEED]) / dt
+                c[ACCELERATION_MIN] = min(c[ACCELERATION_MIN], acceleration)
+                c[ACCELERATION_MAX] = max(c[ACCELERATION_MAX], acceleration)
+                if middle == middle:
+                    jerk = abs((acceleration - c[ACCELERATION]) / middle)
+                    c[JERK_MAX] = max(c[JERK_MAX], jerk)
+                    c[JERK_SUM] += jerk * jerk * middle
+                c[ACCELERATION] = acceleration
+                work = c[INPUT] * fixed.mass[i] * (x - c[POSITION])
+                if work > 0.0:
+                    c[TRACTION] += work
+                else:
+                    c[BRAKING] -= work
+                    if c[SPEED] > ELECTRIC_BRAKE_FROM_MPS:
+                        c[ELECTRIC] -= work
+            c[POSITION], c[SPEED] = x, v
+            c[SPEED_MIN], c[SPEED_MAX] = min(c[SPEED_MIN], v), max(c[SPEED_MAX], v)
+            c[SPEED_SUM] += v
+            violated = v - known.speed_lower[i] < -SLACK or known.speed_upper[i] - v < -SLACK
+            if moves:
+                c[INPUT] = u
+                c[INPUT_MIN], c[INPUT_MAX] = min(c[INPUT_MIN], u), max(c[INPUT_MAX], u)
+                violated = violated or u - known.input_lower[i] < -SLACK or known.input_upper[i] - u < -SLACK
+            if violated and not counts.first[run] <= instants.t[number]:
+                counts.first[run] = instants.t[number]
+            if seen.saturated[k, i]:
+                c[SATURATED] += 1.0
+            if j >= 0:
+                spacing = seen.position[k, j] - x
+                c[SPACING_MIN] = min(c[SPACING_MIN], spacing)
+                c[SPACING_SUM] += spacing
+                if v > MOVING_MPS:
+                    headway = spacing / v
+                    c[HEADWAY_MIN] = min(c[HEADWAY_MIN], headway)
+                    c[HEADWAY_SUM] += headway
+                    c[HEADWAYS] += 1.0
+            error = v - instants.reference[number]
+            c[SPEED_ERROR] = abs(error)
+            if instants.level[number]:
+                if instants.fresh[number]:
+                    c[SIDE] = error
+                beyond = abs(error) if c[SIDE] == 0.0 else (-error if c[SIDE] > 0.0 else error)
+                c[OVERSHOOT] = max(c[OVERSHOOT], beyond)
+        counts.violated[i] |= bits
+        counts.fate[run] = max(counts.fate[run], fate)
+    _links(fixed, seen, steps, counts)
+    _pairs(fixed, instants, seen, steps, counts)
 
 
-@njit(cache=True, error_model="numpy")
-def _pairs(fixed: Fixed, now: Instant, position: Floats, counts: Counts) -> None:
-    pairs, first = fixed.pairs, now.number == 0
+@bare(error_model="numpy")
+def _links(fixed: Fixed, seen: Passage, steps: int, counts: Counts) -> None:
+    links = fixed.links
+    for q in range(len(links.sender)):
+        ahead, behind = links.sender[q], links.receiver[q]
+        for k in range(steps):
+            spacing = seen.position[k, ahead] - seen.position[k, behind]
+            if spacing > 0.0:  # each pair once
+                if spacing < links.lower[q] - ROUNDING:
+                    counts.link[q] |= NEAR
+                if spacing > links.upper[q] + ROUNDING:
+                    counts.link[q] |= FAR
+
+
+@bare(error_model="numpy")
+def _pairs(fixed: Fixed, instants: Instants, seen: Passage, steps: int, counts: Counts) -> None:
+    pairs = fixed.pairs
     for q in range(len(pairs.run)):
-        c, r = counts.pair[q], pairs.run[q]
-        spacing = position[pairs.ahead[q]] - position[pairs.behind[q]]
-        error = spacing - pairs.desired[q]
-        size = abs(error)
-        if now.counts:
-            c[LOWEST], c[HIGHEST] = min(c[LOWEST], spacing), max(c[HIGHEST], spacing)
-            violated = spacing - pairs.lower[q] < -SLACK or pairs.upper[q] - spacing < -SLACK
-            if violated and not counts.first[r] <= now.t:
-                counts.first[r] = now.t
-        if first:
-            c[ERROR_SIDE] = error
-        beyond = size if c[ERROR_SIDE] == 0.0 else (-error if c[ERROR_SIDE] > 0.0 else error)
-        c[ERROR_OVERSHOOT] = max(c[ERROR_OVERSHOOT], beyond)
-        c[ERROR_MAX] = max(c[ERROR_MAX], size)
-        c[ERROR_SQUARES] += error * error
-        c[ERROR_LAST] = size
-        if size > fixed.band:
-            counts.outside[r] = now.number
+        c, r, ahead, behind = counts.pair[q], pairs.run[q], pairs.ahead[q], pairs.behind[q]
+        for k in range(steps):
+            number = seen.number[k]
+            if number < 0:
+                continue
+            spacing = seen.position[k, ahead] - seen.position[k, behind]
+            error = spacing - pairs.desired[q]
+            size = abs(error)
+            if instants.counts[number]:
+                c[LOWEST], c[HIGHEST] = min(c[LOWEST], spacing), max(c[HIGHEST], spacing)
+                violated = spacing - pairs.lower[q] < -SLACK or pairs.upper[q] - spacing < -SLACK
+                if violated and not counts.first[r] <= instants.t[number]:
+                    counts.first[r] = instants.t[number]
+            if number == 0:
+                c[ERROR_SIDE] = error
+            beyond = size if c[ERROR_SIDE] == 0.0 else (-error if c[ERROR_SIDE] > 0.0 else error)
+            c[ERROR_OVERSHOOT] = max(c[ERROR_OVERSHOOT], beyond)
+            c[ERROR_MAX] = max(c[ERROR_MAX], size)
+            c[ERROR_SQUARES] += error * error
+            c[ERROR_LAST] = size
+            if size > fixed.band:
+                counts.outside[r] = max(counts.outside[r], number)

@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from trainctl.ensemble import count, units
 from trainctl.ensemble.count import Counts, Fixed, Pairs
-from trainctl.ensemble.stack import Stack
+from trainctl.ensemble.stack import Stack, restarts
 from trainctl.metrics.driving import JOULES_PER_KWH
 from trainctl.metrics.run import SLACK, nearest
 from trainctl.runs.series import INSTANT, pairs
@@ -25,6 +25,9 @@ Columns = dict[str, Floats]
 
 #: Band of the spacings around what is desired, within which they have settled [m].
 BAND_M = 1.0
+
+#: Bounds of trains as the scenario has them, in the order of ``Bounds``, and what they are where none is stated.
+KNOWN = {"speed_lower_mps": -np.inf, "speed_upper_mps": np.inf, "input_lower_mps2": -np.inf, "input_upper_mps2": np.inf}
 
 
 class Recorded(NamedTuple):
@@ -57,50 +60,42 @@ def fixed(stack: Stack) -> tuple[Fixed, Chained]:
 def _known(runs: tuple[Model, ...]) -> Bounds:
     """Bounds of every train as its resolved scenario states them, which is what metrics go by."""
 
-    def row(key: str, missing: float) -> Floats:
-        found: list[float] = []
-        for p in runs:
-            usual = getattr(p.scenario.bounds, key)
-            usual = missing if usual is None else usual
-            own = [getattr(t, key) for t in p.scenario.train]
-            found += [usual if value is None else value for value in own]
+    def of(p: Model) -> Floats:
+        found = [
+            [usual if value is None else value for value in (getattr(t, key) for t in p.scenario.train)]
+            for key, missing in KNOWN.items()
+            for usual in [missing if getattr(p.scenario.bounds, key) is None else getattr(p.scenario.bounds, key)]
+        ]  # fmt: skip
         return np.array(found)
 
-    return Bounds(
-        row("speed_lower_mps", -np.inf), row("speed_upper_mps", np.inf), row("input_lower_mps2", -np.inf),
-        row("input_upper_mps2", np.inf),
-    )  # fmt: skip
+    first = of(runs[0])
+    return Bounds(*np.concatenate([first if restarts(p, runs[0]) else of(p) for p in runs], axis=1))
 
 
 def _pairs(stack: Stack) -> tuple[Pairs, Chained]:
     """The pairs of all runs; those of runs with the same links are found once."""
-    n, known, listed, chains, begin = stack.trains, dict[bytes, tuple[Floats, list[tuple[int, int]]]](), [], [], 0
-    links = stack.links
-    edges = links.first[::n] if len(links.first) > 1 else links.first
-    for r, p in enumerate(stack.runs):
-        rows = slice(int(edges[r]), int(edges[r + 1]))
-        table = np.stack([
-            links.sender[rows] - r * n, links.receiver[rows] - r * n, links.desired[rows], links.lower[rows], links.upper[rows]
-        ])  # fmt: skip
-        key = table.tobytes()
-        if key not in known:
-            known[key] = _listed(p.scenario.ids, table)
-        found, chain = known[key]
-        listed.append(np.column_stack([found[:, :2] + r * n, found[:, 2:], np.full(len(found), r)]))
-        chains += [(front + begin, back + begin) for front, back in chain]
-        begin += len(found)
-    table = np.concatenate(listed)
-    ends = np.array(chains, np.int64).reshape(-1, 2)
-    ahead, behind, run = (table[:, k].astype(np.int64) for k in (0, 1, 5))
-    desired, lower, upper = (table[:, k].copy() for k in (2, 3, 4))
-    return Pairs(ahead, behind, desired, lower, upper, run), Chained(ends[:, 0].copy(), ends[:, 1].copy())
+    n, links, known = stack.trains, stack.links, dict[bytes, tuple[Floats, Ints]]()
+    run = links.receiver // n
+    table = np.column_stack([links.sender - run * n, links.receiver - run * n, links.desired, links.lower, links.upper])
+    each = []
+    for p, rows in zip(stack.runs, np.split(table, links.first[n:-1:n]), strict=True):
+        if (key := rows.tobytes()) not in known:
+            known[key] = _listed(p.scenario.ids, rows.T)
+        each.append(known[key])
+    count = np.array([len(found) for found, _ in each])
+    listed, of = np.concatenate([found for found, _ in each]), np.repeat(np.arange(len(each)), count)
+    begins = np.repeat(np.cumsum(count) - count, [len(chain) for _, chain in each])
+    chains = np.concatenate([chain for _, chain in each]) + begins[:, None]
+    ahead, behind = (listed[:, k].astype(np.int64) + of * n for k in (0, 1))
+    desired, lower, upper = (listed[:, k].copy() for k in (2, 3, 4))
+    return Pairs(ahead, behind, desired, lower, upper, of), Chained(chains[:, 0].copy(), chains[:, 1].copy())
 
 
-def _listed(ids: tuple[str, ...], table: Floats) -> tuple[Floats, list[tuple[int, int]]]:
-    """Pairs (Q, 5) of one run, from its links (5, L) at one instant, and which of them follow each other."""
+def _listed(ids: tuple[str, ...], table: Floats) -> tuple[Floats, Ints]:
+    """Pairs (Q, 5) of one run, from its links (5, L) at one instant, and which of them follow each other (C, 2)."""
     sender, receiver, desired, lower, upper = table
     if not len(sender):
-        return np.zeros((0, 5)), []
+        return np.zeros((0, 5)), np.zeros((0, 2), np.int64)
     links = pa.table({
         "time_s": np.zeros(len(sender)), "spacing_m": desired, "desired_m": desired, "lower_m": lower, "upper_m": upper,
         "sender": [ids[i] for i in sender.astype(int).tolist()], "receiver": [ids[i] for i in receiver.astype(int).tolist()],
@@ -110,7 +105,9 @@ def _listed(ids: tuple[str, ...], table: Floats) -> tuple[Floats, list[tuple[int
     ends = np.array([(place[a], place[b]) for a, b in listed.ends]).reshape(-1, 2)
     number = {name: q for q, name in enumerate(listed.names)}
     chain = [(number[front], number[back]) for _, front, back in nearest(listed)]
-    return np.column_stack([ends, *(listed.column(name) for name in ("desired_m", "lower_m", "upper_m"))]), chain
+    return np.column_stack([ends, *(listed.column(name) for name in ("desired_m", "lower_m", "upper_m"))]), np.array(
+        chain, np.int64
+    ).reshape(-1, 2)
 
 
 def metrics(

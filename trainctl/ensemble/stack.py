@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from trainctl import draws
 from trainctl.plants import disturbance
 from trainctl.plants.disturbance import END as TABLE_END
 from trainctl.plants.disturbance import START as TABLE_START
@@ -19,7 +20,7 @@ from trainctl.railway import supervisor
 from trainctl.railway.ways import Ways, ways
 from trainctl.scenario.events import Event
 from trainctl.scenario.model import Model
-from trainctl.signals import SPEED, Bounds, Consists, Floats, Formed, Ints, Links, References, Seen
+from trainctl.signals import Bounds, Consists, Floats, Formed, Ints, Links, References, Seen
 from trainctl.stages.orders import Orders
 from trainctl.stages.record import Journal
 from trainctl.topology import graph
@@ -84,6 +85,11 @@ def kind(p: Model) -> tuple[Any, ...]:
     )  # fmt: skip
 
 
+def restarts(p: Model, base: Model) -> bool:
+    """Whether a run was made from another one (``build.restarted``): seed and starts are all that differs."""
+    return p.params is base.params
+
+
 def stacked(runs: Sequence[Model]) -> Stack:
     """Lay runs of one ``kind`` side by side.
 
@@ -94,16 +100,13 @@ def stacked(runs: Sequence[Model]) -> Stack:
     """
     base, count, n = runs[0], len(runs), len(runs[0].scenario.ids)
     model = _model(runs)
-    radios = [p.radio for p in runs]
-    radio = radios[0]._replace(
-        key=np.concatenate([r.key for r in radios]), names=np.concatenate([r.names for r in radios])
-    )  # fmt: skip
-    laid = _laid(runs)
+    radio = base.radio
+    keys = np.array([draws.key(p.scenario.run.seed or 0) for p in runs], np.int64)
+    radio = radio._replace(key=np.repeat(keys, n, axis=0), names=np.tile(radio.names, count))
+    laid = _laid(runs, model)
     row = laid.first[:-1].copy()
-    lane_position = np.concatenate([p.roster.lane_position for p in runs])
-    seen = laid.begin[row] + lane_position
-    tracks = len(base.line.track_ids)
-    formation = np.concatenate([p.start_track + tracks * r for r, p in enumerate(runs)])
+    seen = laid.begin[row] + model.roster.lane_position
+    formation = (_tracks(runs) + len(base.line.track_ids) * np.arange(count)[:, None]).ravel()
     order = graph.order_on_tracks(seen, formation)
     links = _links(runs, order.reshape(count, n) - n * np.arange(count)[:, None], formation.reshape(count, n))
     ahead = np.full(len(order), -1)
@@ -114,7 +117,12 @@ def stacked(runs: Sequence[Model]) -> Stack:
         np.repeat(np.arange(count), n),
     )  # fmt: skip
     formed = Formed(links, formation, ahead, np.ones(count * n, bool), np.zeros(count * n), references, (), None)
-    return Stack(tuple(runs), model, radio, _signals(runs), formed, laid, row, lane_position)
+    return Stack(tuple(runs), model, radio, _signals(runs), formed, laid, row, model.roster.lane_position)
+
+
+def _tracks(runs: Sequence[Model]) -> Ints:
+    """Track of every train at the start, (R, n)."""
+    return np.stack([(runs[0] if restarts(p, runs[0]) else p).start_track for p in runs])
 
 
 def _model(runs: Sequence[Model]) -> Model:
@@ -142,7 +150,7 @@ def _model(runs: Sequence[Model]) -> Model:
     )  # fmt: skip
 
 
-def _laid(runs: Sequence[Model]) -> Ways:
+def _laid(runs: Sequence[Model], model: Model) -> Ways:
     """The ways of all trains once the orders at the start are given, each laid out once for those that have the same."""
     line, known = runs[0].line, dict[tuple[str, ...], tuple[Ints, Floats]]()
 
@@ -153,11 +161,33 @@ def _laid(runs: Sequence[Model]) -> Ways:
                 known[route] = one.edge, one.begin
         return [known[route] for route in routes]
 
-    parts = []
-    for p in runs:
-        here = laid(p.roster.routes)
-        parts += laid(_ordered(p, _joined(here))) if p.scenario.event else here
+    routes = [p.roster.routes for p in runs]
+    here = _joined([part for some in routes for part in laid(some)])
+    if not any(p.scenario.event for p in runs):
+        return here
+    parts, first, n = list[tuple[Ints, Floats]](), runs[0], len(runs[0].scenario.ids)
+    row, speed = here.first[:-1], model.speeds(model.own)
+    position, edge, there = here.begin[row] + model.roster.lane_position, here.edge[row], np.ones(n, bool)
+    orders, stops_in, joined = Orders(first, _Unheard()), _stops_in(first, speed), dict[tuple[int, ...], Ways]()
+    for r, (p, some) in enumerate(zip(runs, routes, strict=True)):
+        of = slice(r * n, (r + 1) * n)
+        if p.scenario.event:
+            before, like = laid(some), restarts(p, first)
+            key = tuple(id(edge) for edge, _ in before)
+            if key not in joined:
+                joined[key] = _joined(before)
+            seen = Seen(position[of], edge[of], joined[key].first[:-1], there)
+            some = _ordered(
+                orders if like else Orders(p, _Unheard()), some, joined[key], seen, speed[of],
+                stops_in[of] if like else _stops_in(p, speed[of]),
+            )  # fmt: skip
+        parts += laid(some)
     return _joined(parts)
+
+
+def _stops_in(p: Model, speed: Floats) -> Floats:
+    """Way in which trains at these speeds [m/s] surely stop, of the same shape [m]: a switch that is nearer is locked."""
+    return supervisor.way_to_stop(p.supervision, p.assumed, speed, np.zeros(len(speed)), p.scenario.run.step_s, p.step_theta)
 
 
 def _joined(parts: Sequence[tuple[Ints, Floats]]) -> Ways:
@@ -165,19 +195,15 @@ def _joined(parts: Sequence[tuple[Ints, Floats]]) -> Ways:
     return Ways(first, np.concatenate([edge for edge, _ in parts]), np.concatenate([begin for _, begin in parts]))
 
 
-def _ordered(p: Model, here: Ways) -> list[tuple[str, ...]]:
-    """The routes of a run's trains once the orders at its start are given; ``here`` are their ways before."""
-    routes: list[tuple[str, ...]] = list(p.roster.routes)
-    row, speed, nobody = here.first[:-1], p.own[p.leading, SPEED], np.full(len(routes), -1)
-    seen = Seen(here.begin[row] + p.roster.lane_position, here.edge[row], row, np.ones(len(routes), bool))
-    stops_in = supervisor.way_to_stop(
-        p.supervision, p.assumed, speed, np.zeros(len(routes)), p.scenario.run.step_s, p.step_theta
-    )  # fmt: skip
-    orders = Orders(p, _Unheard())
-    _, given = orders.step(0.0, seen, here, speed, lambda: stops_in, nobody, orders.initial())
+def _ordered(
+    orders: Orders, routes: Sequence[tuple[str, ...]], here: Ways, seen: Seen, speed: Floats, stops_in: Floats
+) -> list[tuple[str, ...]]:  # fmt: skip
+    """The routes of a run's trains once the orders at its start are given; the other arguments are as in ``Orders.step``."""
+    found = list(routes)
+    _, given = orders.step(0.0, seen, here, speed, lambda: stops_in, np.full(len(found), -1), orders.initial())
     for i, edges in given:
-        routes[i] = edges
-    return routes
+        found[i] = edges
+    return found
 
 
 class _Unheard(Journal):
@@ -192,30 +218,38 @@ class _Unheard(Journal):
 
 def _links(runs: Sequence[Model], order: Ints, formation: Ints) -> Links:
     """The edge lists of all runs one after the other; ``order`` and ``formation`` (R, n) are those of each run."""
-    each = []
-    for p, o, f in zip(runs, order, formation, strict=True):
-        links = p.first_links  # the same but for the order of the tracks, if the trains of each stand in the same order
-        same = np.array_equal(links.order[np.argsort(f[links.order], kind="stable")], o)
-        each.append(links._replace(order=o) if same else graph.links(p.plan, o, f))
     n = order.shape[1]
+    known = np.stack([p.first_links.order for p in runs])
+    tracks = np.argsort(np.take_along_axis(formation, known, 1), axis=1, kind="stable")
+    # The same but for the order of the tracks, if the trains of each stand in the same order.
+    same = (np.take_along_axis(known, tracks, 1) == order).all(axis=1)
+    each = [p.first_links if same[r] else graph.links(p.plan, order[r], formation[r]) for r, p in enumerate(runs)]
     count = np.array([len(links.sender) for links in each])
     shift, rows = np.repeat(n * np.arange(len(runs)), count), np.concatenate([[0], np.cumsum(count)])
     joined = Links(*(np.concatenate(column) for column in zip(*each, strict=True)))
-    first = np.concatenate([*(links.first[:-1] + r for links, r in zip(each, rows[:-1], strict=True)), rows[-1:]])
+    first = np.concatenate([(joined.first.reshape(-1, n + 1)[:, :-1] + rows[:-1, None]).ravel(), rows[-1:]])
     return joined._replace(
         sender=joined.sender + shift, receiver=joined.receiver + shift, first=first,
-        order=joined.order + np.repeat(n * np.arange(len(runs)), n),
+        order=(order + n * np.arange(len(runs))[:, None]).ravel(),
     )  # fmt: skip
 
 
 def _signals(runs: Sequence[Model]) -> Signals:
     """The disturbances of all runs."""
-    run = runs[0].scenario.run
-    each = [disturbance.signals(p.scenario.disturbance, p.scenario.ids, run.step_s, p.scenario.run.seed, p.worst) for p in runs]
-    n, start = len(runs[0].scenario.ids), 0
+    step, first, n, start = runs[0].scenario.run.step_s, runs[0], len(runs[0].scenario.ids), 0
+
+    def of(p: Model) -> Signals:
+        return disturbance.signals(p.scenario.disturbance, p.scenario.ids, step, p.scenario.run.seed, p.worst)
+
+    like = of(first)
+    drawn = not any(entry.pair for entry in first.scenario.disturbance)  # else they depend on the start
+    each = [
+        disturbance.reseeded(like, p.scenario.run.seed) if drawn and restarts(p, first) else of(p) for p in runs
+    ]  # fmt: skip
     for r, signals in enumerate(each):
         signals.whole[:, TRAIN] += r * n
         signals.whole[:, [TABLE_START, TABLE_END]] += start
         start += len(signals.table)
-    whole, number, table, _ = zip(*each, strict=True)
-    return Signals(np.concatenate(whole), np.concatenate(number), np.concatenate(table), n * len(runs))
+    whole, number, table, channels, _ = zip(*each, strict=True)
+    acted = tuple(sorted({c for some in channels for c in some}))
+    return Signals(np.concatenate(whole), np.concatenate(number), np.concatenate(table), acted, n * len(runs))

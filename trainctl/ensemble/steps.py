@@ -9,18 +9,17 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from trainctl import numeric
 from trainctl.ensemble import count, measures, units
-from trainctl.ensemble.count import Instant
+from trainctl.ensemble.count import Instants, Passage
 from trainctl.ensemble.measures import Columns, Recorded
 from trainctl.ensemble.stack import Stack
+from trainctl.kernels import bare
 from trainctl.monitors import on_track
 from trainctl.monitors.on_track import ROUNDING
-from trainctl.numeric import LEAVES_M
+from trainctl.numeric import LEAVES_M, Places
 from trainctl.plants import disturbance
-from trainctl.railway.ways import Ways
 from trainctl.runs.series import INSTANT
 from trainctl.scenario.model import Model
 from trainctl.signals import (
@@ -42,6 +41,9 @@ from trainctl.stages import plant
 from trainctl.stages.control import Control
 from trainctl.topology import exchange
 
+#: Steps that are counted together.
+TOGETHER = 16
+
 
 class Done(NamedTuple):
     """R runs at their end."""
@@ -58,8 +60,7 @@ class State(NamedTuple):
 
     k: int  # steps done
     own: Floats  # (U, s) of all trains' units, at the measured positions
-    row: Ints  # (N,) of every train in its ways
-    lane_position: Floats  # (N,) m, on the edge of that row
+    at: Places
     position: Floats  # (N,) m, along the way
     formed: Formed
     messages: Messages
@@ -88,13 +89,13 @@ class Abreast:
     def initial(self) -> State:
         """All runs at their start."""
         p, stack = self.p, self.stack
-        own, row, lane_position = p.own.copy(), stack.row.copy(), stack.lane_position.copy()
-        position = _measured(stack.ways, row, lane_position, p.consists.first, own)
+        own, at = p.own.copy(), numeric.placed(stack.ways, p.line.length_m, stack.row, stack.lane_position)
+        position = _measured(at, p.consists.first, own)
         scene = p.scene(own, stack.links, 0.0)
         constants = p.law.constants(p.params, scene)
         units = self.plant.relinked(scene, constants, self.plant.initial())
         return State(
-            0, own, row, lane_position, position, stack.formed._replace(constants=constants), exchange.silent(),
+            0, own, at, position, stack.formed._replace(constants=constants), exchange.silent(),
             self.control.initial(), (), units,
         )  # fmt: skip
 
@@ -107,18 +108,15 @@ class Abreast:
             self.free if commanded is None else commanded, self.nothing if added is None else added, acting,
         )  # fmt: skip
         moved = self.plant.step(s.k, t, s.own, demand, self.free, formed, messages, s.plant, acting)
-        row, lane_position, own = s.row.copy(), s.lane_position.copy(), moved.own
-        numeric.go_on(stack.ways, p.line.length_m, moved.motion.displacement, row, lane_position)
-        position = _measured(stack.ways, row, lane_position, p.consists.first, own)
-        state = State(
-            s.k + 1, own, row, lane_position, position, formed, moved.messages, demand, memory, moved.state
-        )  # fmt: skip
+        own, at = moved.own, numeric.gone_on(stack.ways, p.line.length_m, moved.motion.displacement, s.at)
+        position = _measured(at, p.consists.first, own)
+        state = State(s.k + 1, own, at, position, formed, moved.messages, demand, memory, moved.state)
         return Stepped(state, moved.motion, acting, demand.saturated | moved.motion.limited)
 
     def left(self, s: State) -> Bools:
         """Trains (N,) that have left the line."""
         ends = self.stack.ways.first[1:] - 1
-        gone: Bools = (s.row == ends) & (s.lane_position > self.p.line.length_m[self.stack.ways.edge[ends]] - LEAVES_M)
+        gone: Bools = (s.at.row == ends) & (s.at.lane_position > self.p.line.length_m[self.stack.ways.edge[ends]] - LEAVES_M)
         return gone
 
 
@@ -129,32 +127,35 @@ def simulated(stack: Stack) -> Done:
     fixed, chained = measures.fixed(stack)
     counts = count.nothing(fixed, len(stack.runs))
     due = [k for k in range(run.steps + 1) if k % run.recorded_steps == 0 or k == run.steps]
-    instants = dict(zip(due, _instants(p, np.array(due) * run.step_s), strict=True))
+    numbers = {k: m for m, k in enumerate(due)}
+    instants, passage, rows = _instants(p, np.array(due) * run.step_s), Passage.empty(TOGETHER, len(stack.row)), 0
     recorded = Recorded(np.array(due) * run.step_s, np.empty((len(due), len(p.leading))))
     there, track, length = np.ones(len(stack.row), bool), on_track.track(p.rails, p.line.tracks), p.consists.train_length()
     lowest = float(track.limit[stack.ways.edge].min())
     s = abreast.initial()
     tallied = units.watched(stack, p.scene(s.own, stack.links, 0.0)) if p.has_units else None
     while True:
-        t, now, last = s.k * run.step_s, instants.get(s.k), s.k == run.steps
+        t, number, last = s.k * run.step_s, numbers.get(s.k, -1), s.k == run.steps
         speed = p.speeds(s.own)
         if speed.max() > lowest + ROUNDING:
-            limit, _ = on_track.limits(track, stack.ways, s.row, s.position, length, there)
+            limit, _ = on_track.limits(track, stack.ways, s.at.row, s.position, length, there)
             counts.violated[speed > limit + ROUNDING] |= count.ABOVE_LIMIT
         past = None
-        if now is not None:
+        if number >= 0:
             past, taken = abreast.plant.taken(s.plant)
             s = s._replace(plant=taken)
         stepped = None if last else abreast.after(s)
         motion, acting = (None, None) if stepped is None else (stepped.motion, stepped.acting)
-        force = abreast.free if motion is None else motion.input
         saturated = s.demand.saturated if stepped is None else stepped.saturated
-        count.watch(fixed, s.position, speed, force, not last, counts)
-        if now is not None:
-            count.count(fixed, now, s.position, speed, force, saturated, counts)
-            recorded.position[now.number] = s.position
+        passage.write(rows, s.position, speed, None if motion is None else motion.input, saturated, number)
+        rows += 1
+        if rows == TOGETHER or last:
+            count.count(fixed, instants, passage, rows, counts)
+            rows = 0
+        if number >= 0:
+            recorded.position[number] = s.position
         if tallied is not None:
-            seen = Seen(s.position, stack.ways.edge[s.row], s.row, there)
+            seen = Seen(s.position, stack.ways.edge[s.at.row], s.at.row, there)
             instant = Row(
                 t, seen, s.formed.formation, s.own, speed, s.formed.ahead, stack.links, motion, saturated, past, acting,
                 s.formed.led,
@@ -175,19 +176,22 @@ def simulated(stack: Stack) -> Done:
     )  # fmt: skip
 
 
-@njit(cache=True)
-def _measured(ways: Ways, row: Ints, lane_position: Floats, first: Ints, own: Floats) -> Floats:
+def _measured(at: Places, first: Ints, own: Floats) -> Floats:
     """Shift every train in ``own`` (U, s) onto its place, as ``loop`` does; positions of the heads [m], (N,)."""
-    position = np.empty(len(row))
-    for i in range(len(row)):
-        position[i] = ways.begin[row[i]] + lane_position[i]
-        shift = position[i] - own[first[i], POSITION]
-        for u in range(first[i], first[i + 1]):
-            own[u, POSITION] += shift
+    position = at.position
+    _shift(position, first, own)
     return position
 
 
-def _instants(p: Model, times: Floats) -> list[Instant]:
+@bare
+def _shift(position: Floats, first: Ints, own: Floats) -> None:
+    for i in range(len(position)):
+        shift = position[i] - own[first[i], POSITION]
+        for u in range(first[i], first[i + 1]):
+            own[u, POSITION] += shift
+
+
+def _instants(p: Model, times: Floats) -> Instants:
     """The recorded instants, as ``metrics`` takes them."""
     reference = p.reference
     speed = leader_over(reference, times)[SPEED]
@@ -200,13 +204,8 @@ def _instants(p: Model, times: Floats) -> list[Instant]:
     age = times - times[0]
     period = p.scenario.run.control_period_s or p.scenario.run.step_s
     counts = (age >= period - INSTANT) & (age > 0)
-    return [
-        Instant(
-            float(times[m]), float(dt[m]), float(middle[m]), bool(counts[m]), float(speed[m]), bool(stretch[m] >= 0),
-            m == 0 or bool(stretch[m] != stretch[m - 1]), m, m == len(times) - 1,
-        )
-        for m in range(len(times))
-    ]  # fmt: skip
+    fresh = np.diff(stretch, prepend=-2) != 0
+    return Instants(times, dt, middle, counts, np.ascontiguousarray(speed), stretch >= 0, fresh)
 
 
 def _violations(stack: Stack, counts: count.Counts) -> Ints:
@@ -227,7 +226,7 @@ def _why_alone(abreast: Abreast, s: State, fate: Ints) -> tuple[str | None, ...]
     line, n, off = stack.model.line, stack.trains, abreast.left(s)
     track = np.array([line.track_ids.index(name) for name in line.tracks])[stack.ways.edge]
     changes = np.add.accumulate(np.concatenate([[0], np.diff(track) != 0]))  # of track, along the ways
-    changed = changes[s.row] > changes[stack.row]
+    changed = changes[s.at.row] > changes[stack.row]
     words = {count.TOUCHES: "trains touch or pass one another", count.NOT_FINITE: "its numbers are no longer finite"}
     left = {True: "a train changes track", False: None}
 

@@ -15,15 +15,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Annotated, Literal, NamedTuple, get_args
 
 import numpy as np
-from numba import njit
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from pydantic.json_schema import SkipJsonSchema
 from pydantic_core import PydanticCustomError
 
-from trainctl.draws import WORD, gauss, uniforms, word
+from trainctl import draws
+from trainctl.draws import gauss, uniforms, word
+from trainctl.kernels import bare
 from trainctl.signals import Disturbed, Floats, Ints, Table
 
 #: What a disturbance acts on; the rows of every array of shape (5, n) here.
@@ -198,6 +200,7 @@ class Signals(NamedTuple):
     whole: Ints  # (R, 10)
     number: Floats  # (R, 8)
     table: Floats  # the tables of all rows, one after the other
+    channels: tuple[int, ...]  # that rows act on
     trains: int  # n
 
 
@@ -273,7 +276,7 @@ def signals(
         if entry.shape == "gaussian" and getattr(entry, entry.amplitude_key) is None:
             amplitude = np.full(len(named), np.inf)
         scale = 0.01 if entry.channel == RESISTANCE else 1.0
-        key = entry.seed if entry.seed is not None else seed or 0
+        low, high = draws.key(entry.seed if entry.seed is not None else seed or 0)
         stream = entry.channel + len(CHANNELS) * (ordinal if entry.seed is None else 0)
         begin, signs = round((entry.from_s or 0.0) / step), None
         if entry.pair is not None and entry.peak_s is not None and worst is not None:
@@ -283,7 +286,7 @@ def signals(
             column = np.asarray(entry.values or (), float) if signs is None else signs[entry.channel, :, index[name]]
             whole.append((
                 entry.channel, SHAPES.index(entry.shape), index[name], begin, start, start + len(column),
-                key & WORD, key >> 32 & WORD, word(name), stream,
+                low, high, word(name), stream,
             ))  # fmt: skip
             number.append((
                 scale * a, scale * s, entry.from_s or 0.0, _or(entry.to_s, math.inf), _or(entry.from_m, -math.inf),
@@ -295,8 +298,16 @@ def signals(
         whole=np.array(whole, np.int64).reshape(-1, 10),
         number=np.array(number, float).reshape(-1, 8),
         table=np.concatenate([np.zeros(0), *tables]),
+        channels=tuple(sorted({entry.channel for entry in entries})),
         trains=len(trains),
     )
+
+
+def reseeded(like: Signals, seed: int | None) -> Signals:
+    """The same disturbances in a run with another ``[run] seed``."""
+    whole = like.whole.copy()
+    whole[whole[:, STREAM] >= len(CHANNELS), KEY_LOW : KEY_HIGH + 1] = draws.key(seed or 0)
+    return like._replace(whole=whole)
 
 
 def _or(value: float | None, otherwise: float) -> float:
@@ -324,17 +335,31 @@ def at(signals: Signals, k: int, t: float, position: Floats) -> Disturbed:
     Returns
     -------
     Disturbed
+        Not to be written into.
     """
-    out = np.zeros((len(CHANNELS), signals.trains))
-    if len(signals.whole):
-        _evaluate(signals.whole, signals.number, signals.table, k, t, position, out)
-    out[RESISTANCE] += 1.0
-    return Disturbed(*out)
+    calm, channels = _calm(signals.trains), signals.channels
+    if not channels:
+        return calm
+    out, place = np.zeros((len(channels), signals.trains)), np.zeros(len(CHANNELS), np.int64)
+    place[list(channels)] = range(len(channels))
+    _evaluate(signals.whole, signals.number, signals.table, k, t, position, place, out)
+    if RESISTANCE in channels:
+        out[place[RESISTANCE]] += 1.0
+    return Disturbed(*(out[place[c]] if c in channels else calm[c] for c in range(len(CHANNELS))))
 
 
-@njit(cache=True)
-def _evaluate(whole: Ints, number: Floats, table: Floats, k: int, t: float, position: Floats, out: Floats) -> None:
-    """Add every row's value to ``out`` (5, n)."""
+@cache
+def _calm(trains: int) -> Disturbed:
+    """Nothing acts."""
+    nothing = np.zeros(trains)
+    return Disturbed(nothing, nothing, nothing, np.ones(trains), nothing)
+
+
+@bare
+def _evaluate(
+    whole: Ints, number: Floats, table: Floats, k: int, t: float, position: Floats, place: Ints, out: Floats
+) -> None:  # fmt: skip
+    """Add every row's value to ``out``, a row (n,) for each channel: that at its ``place`` (5,)."""
     for r in range(len(whole)):
         row, real = whole[r], number[r]
         i = row[TRAIN]
@@ -360,4 +385,4 @@ def _evaluate(whole: Ints, number: Floats, table: Floats, k: int, t: float, posi
                 value = a * (2.0 * first - 1.0)
             else:
                 value = min(max(real[STD] * gauss(first, second), -a), a)
-        out[row[ON], i] += value
+        out[place[row[ON]], i] += value

@@ -14,12 +14,12 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numba import njit
 from pydantic import Field, ValidationInfo, field_validator
 
 from trainctl.contracts import PointPlant
 from trainctl.davis import resistance as resistance
 from trainctl.davis import resistance_of
+from trainctl.kernels import bare
 from trainctl.plants import faults as actuators
 from trainctl.plants.faults import Fault
 from trainctl.signals import GRAVITY, POSITION, SPEED, Bools, Bounds, Consists, Floats, Reliance, Scene, Table
@@ -140,7 +140,7 @@ def constants(
 def climbing(position: Floats, gradient: Floats) -> Floats:
     """Weight along the line per mass [N/kg], rising positive, of trains whose front is at ``position`` [m], shape (n,)."""
     if len(gradient) == 0:
-        return np.zeros_like(position)
+        return np.zeros(len(position))
     where = np.maximum(np.searchsorted(gradient[:, 0], position, side="right") - 1, 0)
     force: Floats = GRAVITY * gradient[where, 1]
     return force
@@ -218,26 +218,39 @@ def advance(constants: Constants, own: Floats, acceleration: Floats, step: float
     falls below 0.
     """
     moved = Mapped(np.empty_like(own), *np.empty((2, len(own))), *np.empty((2, len(own)), dtype=bool))
-    climb = climbing(own[:, POSITION], constants.gradient) + GRAVITY * constants.slope
-    _advance(constants, own, climb, acceleration, step, kick, moved)
+    _advance(constants, own, climbing(own[:, POSITION], constants.gradient), acceleration, step, kick, moved)
     return moved
 
 
-@njit(cache=True, error_model="numpy")
+def believed(constants: Constants, own: Floats) -> Floats:
+    """Running resistance as the trains believe it, and gradient, at ``own`` (n, 2) [N/kg], shape (n,)."""
+    force = climbing(own[:, POSITION], constants.gradient)
+    _add_believed(constants.davis, constants.slope, own, force)
+    return force
+
+
+@bare(error_model="numpy")
+def _add_believed(davis: Floats, slope: Floats, own: Floats, force: Floats) -> None:
+    for i in range(len(own)):
+        force[i] = resistance_of(i, own[i, SPEED], davis) + (force[i] + GRAVITY * slope[i])
+
+
+@bare(error_model="numpy")
 def _advance(
     constants: Constants, own: Floats, climb: Floats, acceleration: Floats, step: float, kick: Kick, moved: Mapped
 ) -> None:
-    """Write the step of every train into ``moved``. ``np.minimum`` and ``np.maximum`` pass on what is not a number."""
+    """Write the step of every train into ``moved``. ``min`` and ``max`` pass on a first number that is none."""
     c = constants
     for i in range(len(own)):
         v = own[i, SPEED]
         believed = resistance_of(i, v, c.davis)
-        asked = believed + climb[i] + acceleration[i] + kick.input[i]
-        applied = np.minimum(np.maximum(asked, c.input_lower[i]), c.input_upper[i])
-        free = v + applied * step - (c.resistance_factor[i] * believed + climb[i]) * step + kick.speed[i]
-        v_next = np.minimum(np.maximum(np.maximum(free, c.speed_lower[i]), 0.0), c.speed_upper[i])
+        weight = climb[i] + GRAVITY * c.slope[i]
+        asked = believed + weight + acceleration[i] + kick.input[i]
+        applied = min(max(asked, c.input_lower[i]), c.input_upper[i])
+        free = v + applied * step - (c.resistance_factor[i] * believed + weight) * step + kick.speed[i]
+        v_next = min(max(max(free, c.speed_lower[i]), 0.0), c.speed_upper[i])
         distance = v * step + kick.position[i]
-        displacement = np.maximum(distance, 0.0)
+        displacement = max(distance, 0.0)
         moved.own[i, POSITION], moved.own[i, SPEED] = own[i, POSITION] + displacement, v_next
         moved.input[i], moved.displacement[i] = applied, displacement
         moved.limited[i] = applied != asked or v_next != free

@@ -209,15 +209,15 @@ class Orders:
             )
         join = over.start_m + over.length_m
         after = (join - float(seen.position[i])) / max(float(speed[i]), 0.1)
-        then = seen.position + speed * after
-        there = np.array([self.p.line.tracks[e] == over.to_track for e in seen.edge.tolist()]) & seen.present
-        meets = np.flatnonzero(there & (then - self.length < join) & (then > join - self.length[i]))
-        if len(meets):
-            j = int(meets[0])
-            raise Refused(
-                f"train {self.p.scenario.ids[j]} would be at the join of crossover {over.id} at {join:.1f} m at the same time, and"
-                f" nothing would keep them apart: {cure}"
-            )
+        then, length = (seen.position + speed * after).tolist(), self.length.tolist()
+        for j, (edge, there) in enumerate(zip(seen.edge.tolist(), seen.present.tolist(), strict=True)):
+            if not there or self.p.line.tracks[edge] != over.to_track:
+                continue
+            if then[j] - length[j] < join and then[j] > join - length[i]:
+                raise Refused(
+                    f"train {self.p.scenario.ids[j]} would be at the join of crossover {over.id} at {join:.1f} m at the same time,"
+                    f" and nothing would keep them apart: {cure}"
+                )
 
     def _to_an_edge(self, event: Event, i: int, seen: Seen, ways: Ways, lock: float) -> tuple[tuple[str, ...], dict[str, Any]]:
         rails = self.p.rails

@@ -86,11 +86,7 @@ class Points:
 
     def believed_resistance(self, own: Floats) -> Floats:
         """Running resistance and gradient at the present speed and place [N/kg], shape (n,)."""
-        return resistance(own[:, SPEED], self.constants.davis) + self._climbing(own)
-
-    def _climbing(self, own: Floats) -> Floats:
-        force: Floats = point.climbing(own[:, POSITION], self.constants.gradient) + GRAVITY * self.constants.slope
-        return force
+        return point.believed(self.constants, own)
 
     def step(
         self, k: int, t: float, own: Floats, demand: Demand, ordered: Floats, formed: Formed, messages: Messages, state: State,
@@ -99,9 +95,11 @@ class Points:
         """One exact step of the discrete map; ``ordered`` (n,) accelerations stand for the law's where they are not NaN."""
         constants = self.constants._replace(resistance_factor=disturbed.resistance)
         kick = point.Kick(disturbed.position, disturbed.speed, disturbed.input)
-        asked = np.where(np.isnan(ordered), demand.acceleration, ordered)
+        free = np.isnan(ordered)
+        asked = demand.acceleration if free.all() else np.where(free, demand.acceleration, ordered)
         moved = self.plant.advance(constants, own, asked, self.step_s, kick)
-        mean = (moved.own[:, SPEED] - own[:, SPEED]) / self.step_s
+        mean = moved.own[:, SPEED] - own[:, SPEED]
+        mean /= self.step_s
         motion = Motion(moved.displacement, moved.input, mean, mean, moved.limited, moved.clipped, None, {})
         return Moved(moved.own, motion, messages, state)
 

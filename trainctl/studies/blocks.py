@@ -68,7 +68,7 @@ def blocks(batch: Batch, model: Model, workers: int) -> list[Batch]:
 
 def simulate_block(block: Batch) -> Part:
     """Run a block in this process, results in the order of its runs. What cannot be stacked runs by itself. Never raises."""
-    from trainctl.ensemble.stack import alone, kind
+    from trainctl.ensemble.stack import alone, kind, restarts
 
     jobs, models = block.each(), list[Model]()
     why: list[str | None] = []
@@ -76,7 +76,7 @@ def simulate_block(block: Batch) -> Part:
         model: Model | None = None
         try:
             model = job_model(job, like=models[0] if models else None)
-            if models and model.params is models[0].params:  # made from that one: seed and starts are all that differs
+            if models and restarts(model, models[0]):
                 reason = None
             else:
                 reason = alone(model) or (None if not models or kind(model) == kind(models[0]) else "it is unlike the others")

@@ -15,12 +15,13 @@ References
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from trainctl import draws
+from trainctl.kernels import bare
 from trainctl.signals import Bools, Floats, Ints, Links, Messages
 from trainctl.topology.graph import reach
 
@@ -60,6 +61,14 @@ class Radio(NamedTuple):
             if begin <= t + 1e-9 < end:
                 out[slice(None) if train < 0 else int(train)] = True
         return out
+
+
+class Brought(NamedTuple):
+    """What links have brought, as ``Messages`` has it."""
+
+    heard: Floats  # (L, w)
+    ever: Bools  # (L,)
+    newest: Ints  # (L,)
 
 
 def silent() -> Messages:
@@ -115,33 +124,33 @@ def deliver(
     """
     rows, n = len(links.sender), len(sent)
     known = len(messages.newest) == rows and messages.heard.shape == (rows, sent.shape[1])  # the first message fixes the width
-    heard = messages.heard.copy() if known else np.zeros((rows, sent.shape[1]))
+    heard = messages.heard if known else np.zeros((rows, sent.shape[1]))
     ever = messages.ever if len(messages.ever) == rows else np.zeros(rows, bool)
-    newest, bad = (messages.newest.copy(), messages.bad.copy()) if known else (np.full(rows, -1), np.full(rows, UNKNOWN))
+    newest, bad = (messages.newest, messages.bad) if known else (np.full(rows, -1), np.full(rows, UNKNOWN))
     out = radio.out(t, n)
     spoke, said, quiet = _who_sends(radio, messages, place, out)
     under_way = (*messages.sent, sent)[-radio.oldest - 1 :]
     who = (*messages.spoke, spoke)[-radio.oldest - 1 :]
-    age, told = np.full(rows, -1), np.array(who) if len(who) > 1 else spoke[None]
-    reaches = reach(position, links, radio.radius) if math.isfinite(radio.radius) else np.ones(rows, bool)
-    _arrive(
+    reaches = reach(position, links, radio.radius) if math.isfinite(radio.radius) else np.zeros(0, bool)
+    before = Brought(heard, ever, newest)
+    after = Brought(np.empty_like(heard), np.empty(rows, bool), np.empty(rows, np.int64))
+    arrives = np.empty(rows, bool)
+    if radio.turns_bad > 0.0:
+        bad = bad.copy()
+    came = _arrive(
         radio.loss, radio.bad_loss, radio.turns_bad, radio.turns_good, radio.delay, radio.spread, radio.exponential, radio.key,
-        radio.names, links.sender, links.receiver, count, told, out, reaches, newest, bad, age,
+        radio.names, links.sender, links.receiver, count, _oldest_first(under_way), _oldest_first(who), out, reaches, before, bad,
+        after, arrives,
     )  # fmt: skip
-    arrives = age >= 0
-    for a in range(radio.delay, len(under_way)):
-        _take(age, a, under_way[-1 - a], links.sender, heard)
-    counted = messages.counted + (np.count_nonzero(spoke), np.count_nonzero(arrives))
-    return Messages(under_way, heard, ever | arrives, newest, bad, who, said, quiet, counted), arrives
+    counted = messages.counted.copy()
+    counted[0] += np.count_nonzero(spoke)
+    counted[1] += came
+    return Messages(under_way, after.heard, after.ever, after.newest, bad, who, said, quiet, counted), arrives
 
 
-@njit(cache=True)
-def _take(age: Ints, a: int, sent: Floats, sender: Ints, heard: Floats) -> None:
-    """Write into ``heard`` (L, w) what the links bring whose message is of the age ``a``, as ``sent`` (n, w) then."""
-    for k in range(len(age)):
-        if age[k] == a:
-            for c in range(sent.shape[1]):
-                heard[k, c] = sent[sender[k], c]
+def _oldest_first(rows: Sequence[Any]) -> Any:
+    """The same as one array; of a single one, which is what there is without delays, nothing is copied."""
+    return np.array(rows) if len(rows) > 1 else np.ascontiguousarray(rows[0])[None]
 
 
 def _who_sends(radio: Radio, messages: Messages, place: Floats, out: Bools) -> tuple[Bools, Floats, Ints]:
@@ -158,20 +167,21 @@ def _who_sends(radio: Radio, messages: Messages, place: Floats, out: Bools) -> t
     return due, np.where(due, place, said), np.where(due, 0, quiet)
 
 
-@njit(cache=True)
+@bare
 def _arrive(
     loss: float, bad_loss: float, turns_bad: float, turns_good: float, delay: int, spread: float, exponential: bool, key: Ints,
-    names: Ints, sender: Ints, receiver: Ints, count: int, spoke: Bools, out: Bools, reaches: Bools, newest: Ints, bad: Ints,
-    age: Ints,
-) -> None:  # fmt: skip
-    """Write into ``age`` (L,) how old the message is that each link brings now, -1: none; go on with ``newest`` and ``bad``.
+    names: Ints, sender: Ints, receiver: Ints, count: int, sent: Floats, spoke: Bools, out: Bools, reaches: Bools, before: Brought,
+    bad: Ints, after: Brought, arrives: Bools,
+) -> int:  # fmt: skip
+    """Write what each link has brought by now, and whether it brings something now (L,); how many do. ``bad`` goes on in place.
 
-    ``spoke`` (D, n) is who sent in the last D exchanges, oldest first.
+    ``sent`` (D, n, w) is what was said in the last D exchanges, oldest first, and ``spoke`` (D, n) who did send it. ``reaches`` may
+    be empty: all do.
     """
-    depth = len(spoke)
+    depth, came = len(spoke), 0
     for k in range(len(sender)):
         s, r = sender[k], receiver[k]
-        lost = loss
+        lost, age, newest = loss, -1, before.newest[k]
         if turns_bad > 0.0:
             turn, begin = draws.uniforms(count, draws.BURST, names[s], names[r], key[r, 0], key[r, 1])
             if bad[k] < 0:
@@ -179,23 +189,31 @@ def _arrive(
             else:
                 bad[k] = turn >= turns_good if bad[k] else turn < turns_bad
             lost = bad_loss if bad[k] else loss
-        if out[s] or out[r] or not reaches[k]:
-            continue
-        for a in range(delay, depth):
-            sent = count - a
-            if sent <= newest[k]:
-                break
-            if not spoke[depth - 1 - a, s]:
-                continue
-            takes = delay
-            if lost > 0.0 or spread > 0.0:
-                drawn, longer = draws.uniforms(sent + delay, draws.LOSS, names[s], names[r], key[r, 0], key[r, 1])
-                if spread > 0.0:
-                    more = min(-math.log(1.0 - longer), CUT_OFF) if exponential else longer
-                    takes += math.ceil(spread * more)
-                if takes != a or drawn < lost:
+        if not (out[s] or out[r]) and (len(reaches) == 0 or reaches[k]):
+            for a in range(delay, depth):
+                number = count - a
+                if number <= newest:
+                    break
+                if not spoke[depth - 1 - a, s]:
                     continue
-            elif takes != a:
-                continue
-            age[k], newest[k] = a, sent
-            break
+                takes = delay
+                if lost > 0.0 or spread > 0.0:
+                    drawn, longer = draws.uniforms(number + delay, draws.LOSS, names[s], names[r], key[r, 0], key[r, 1])
+                    if spread > 0.0:
+                        more = min(-math.log(1.0 - longer), CUT_OFF) if exponential else longer
+                        takes += math.ceil(spread * more)
+                    if takes != a or drawn < lost:
+                        continue
+                elif takes != a:
+                    continue
+                age, newest = a, number
+                break
+        after.newest[k], arrives[k], after.ever[k] = newest, age >= 0, before.ever[k] or age >= 0
+        if age >= 0:
+            came += 1
+            for c in range(sent.shape[2]):
+                after.heard[k, c] = sent[depth - 1 - age, s, c]
+        else:
+            for c in range(sent.shape[2]):
+                after.heard[k, c] = before.heard[k, c]
+    return came
