@@ -155,6 +155,16 @@ class Line:
         ValueError
             If the edge or the crossover does not exist, the crossover leaves another track, or its switch lies behind.
         """
+        if (current_edge, crossover_id) not in self._over:
+            self._over[current_edge, crossover_id] = self._led_over(current_edge, crossover_id)
+        return self._over[current_edge, crossover_id]
+
+    @cached_property
+    def _over(self) -> dict[tuple[str, str], tuple[str, ...]]:
+        """Routes over crossovers that have been asked for."""
+        return {}
+
+    def _led_over(self, current_edge: str, crossover_id: str) -> tuple[str, ...]:
         if current_edge not in self.index:
             raise ValueError(f"edge {current_edge}: not on this line")
         if crossover_id not in self.crossover:

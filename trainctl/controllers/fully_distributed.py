@@ -126,11 +126,9 @@ def message(constants: Constants, own: Trains, leader: Floats) -> Floats:
 
     In the moving frame a message that comes late is off by what its sender has moved against the formation, not by v_r T.
     """
-    z = (1.0 - constants.theta) * own.speed
-    z *= constants.period
-    z += own.position
-    z -= leader[POSITION]
-    return z[:, None]
+    z = np.empty((len(own.speed), 1))
+    _write_predictions(constants.theta, constants.period, own.position, own.speed, _each(leader[POSITION], own), z)
+    return z
 
 
 def demand(constants: Constants, own: Trains, leader: Floats, links: Links, heard: Floats) -> Demand:
@@ -160,27 +158,45 @@ def demand(constants: Constants, own: Trains, leader: Floats, links: Links, hear
     """
     n = len(own.speed)
     acceleration, saturated = np.empty(n), np.empty(n, dtype=bool)
-    z, speed = message(constants, own, leader)[:, 0], np.ascontiguousarray(own.speed)
-    believed, came = np.ascontiguousarray(own.resistance), np.ascontiguousarray(heard[:, 0])
-    wanted = leader[SPEED] if leader.ndim > 1 else np.full(n, leader[SPEED])  # formations may have references of their own
-    _admitted(constants, z, speed, believed, came, wanted, links, acceleration, saturated)
+    place, wanted = (_each(leader[k], own) for k in (POSITION, SPEED))
+    _admitted(constants, Trains(*map(np.ascontiguousarray, own)), place, wanted, links, heard[:, 0], acceleration, saturated)
     return Demand(acceleration, saturated)
+
+
+def _each(value: Floats, own: Trains) -> Floats:
+    """A number of the reference for every train; formations may have references of their own."""
+    return value if np.ndim(value) else np.full(len(own.speed), value)
+
+
+@bare(inline="always")
+def _predicted(position: float, speed: float, theta: float, period: float, reference: float) -> float:
+    """The z of one train."""
+    return position + (1.0 - theta) * speed * period - reference
+
+
+@bare(error_model="numpy")
+def _write_predictions(theta: float, period: float, position: Floats, speed: Floats, reference: Floats, z: Floats) -> None:
+    """Write what every train sends, (n, 1)."""
+    for i in range(len(z)):
+        z[i, 0] = _predicted(position[i], speed[i], theta, period, reference[i])
 
 
 @bare(error_model="numpy")
 def _admitted(
-    constants: Constants, z: Floats, speed: Floats, believed: Floats, heard: Floats, reference: Floats, links: Links,
-    acceleration: Floats, saturated: Bools,
+    constants: Constants, own: Trains, place: Floats, wanted: Floats, links: Links, heard: Floats, acceleration: Floats,
+    saturated: Bools,
 ) -> None:  # fmt: skip
     """Write what (10) to (12) give every train. What is not a number is passed on: a message's by G, a train's own by its speed."""
     c, T = constants, constants.period
-    for i in range(len(z)):
+    for i in range(len(wanted)):
+        v, v_r = own.speed[i], wanted[i]
+        z = _predicted(own.position[i], v, c.theta, T, place[i])
         alpha, Alpha, total, hold = -np.inf, np.inf, 0.0, False
         begin, end = links.first[i], links.first[i + 1]
         for k in range(begin, end):
             z_ji, gamma, Gamma = links.desired[k], links.lower[k], links.upper[k]
             if links.heard[k]:
-                z_ji = heard[k] - z[i]
+                z_ji = heard[k] - z
             else:
                 hold = True
             if c.ratchet:
@@ -189,13 +205,12 @@ def _admitted(
             total += z_ji - links.desired[k]
         G = total / (2 * (end - begin)) if end > begin else 0.0
 
-        v, v_r = speed[i], reference[i]
         beta, Beta = (c.rho[i] - v_r) * T, (c.Rho[i] - v_r) * T
         if c.own_speed:
-            minimum = maximum = believed[i]
+            minimum = maximum = own.resistance[i]
             if c.held:  # the input is acceleration plus resistance, and the latter changes while the former is held
                 now = resistance_of(i, v, c.davis)
-                minimum, maximum = believed[i] + (c.f[i] - now), believed[i] + (c.F[i] - now)
+                minimum, maximum = own.resistance[i] + (c.f[i] - now), own.resistance[i] + (c.F[i] - now)
             vbar = v - v_r
             eta, Eta = vbar * T + (c.mu[i] - minimum) * (T * T), vbar * T + (c.Mu[i] - maximum) * (T * T)
         else:

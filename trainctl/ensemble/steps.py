@@ -20,6 +20,7 @@ from trainctl.monitors import on_track
 from trainctl.monitors.on_track import ROUNDING
 from trainctl.numeric import LEAVES_M, Places
 from trainctl.plants import disturbance
+from trainctl.railway.ways import Ways
 from trainctl.runs.series import INSTANT
 from trainctl.scenario.model import Model
 from trainctl.signals import (
@@ -42,7 +43,15 @@ from trainctl.stages.control import Control
 from trainctl.topology import exchange
 
 #: Steps that are counted together.
-TOGETHER = 16
+TOGETHER = 8
+
+
+#: Why a run cannot be told from a stack, beside ``count.TOUCHES`` and ``count.NOT_FINITE``, which go before.
+LEAVES, CHANGES = 3, 4
+WORDS = {
+    count.TOUCHES: "trains touch or pass one another", count.NOT_FINITE: "its numbers are no longer finite",
+    LEAVES: "a train leaves the line", CHANGES: "a train changes track",
+}  # fmt: skip
 
 
 class Done(NamedTuple):
@@ -131,7 +140,7 @@ def simulated(stack: Stack) -> Done:
     instants, passage, rows = _instants(p, np.array(due) * run.step_s), Passage.empty(TOGETHER, len(stack.row)), 0
     recorded = Recorded(np.array(due) * run.step_s, np.empty((len(due), len(p.leading))))
     there, track, length = np.ones(len(stack.row), bool), on_track.track(p.rails, p.line.tracks), p.consists.train_length()
-    lowest = float(track.limit[stack.ways.edge].min())
+    lowest = float(track.limit[np.bincount(stack.ways.edge, minlength=len(track.limit)) > 0].min())
     s = abreast.initial()
     tallied = units.watched(stack, p.scene(s.own, stack.links, 0.0)) if p.has_units else None
     while True:
@@ -222,16 +231,19 @@ def _violations(stack: Stack, counts: count.Counts) -> Ints:
 
 def _why_alone(abreast: Abreast, s: State, fate: Ints) -> tuple[str | None, ...]:
     """Runs that cannot be told from here, and why."""
-    stack = abreast.stack
-    line, n, off = stack.model.line, stack.trains, abreast.left(s)
-    track = np.array([line.track_ids.index(name) for name in line.tracks])[stack.ways.edge]
-    changes = np.add.accumulate(np.concatenate([[0], np.diff(track) != 0]))  # of track, along the ways
-    changed = changes[s.at.row] > changes[stack.row]
-    words = {count.TOUCHES: "trains touch or pass one another", count.NOT_FINITE: "its numbers are no longer finite"}
-    left = {True: "a train changes track", False: None}
+    stack, line = abreast.stack, abreast.p.line
+    changed = np.zeros(len(stack.row), bool)
+    _changed(stack.ways, np.array([line.track_ids.index(name) for name in line.tracks]), stack.row, s.at.row, changed)
+    cause = fate.copy()
+    for trains, number in ((abreast.left(s), LEAVES), (changed, CHANGES)):
+        cause[(cause == count.GOES_ON) & trains.reshape(len(cause), -1).any(axis=1)] = number
+    return tuple(map(WORDS.get, cause.tolist()))
 
-    def why(r: int) -> str | None:
-        of = slice(r * n, (r + 1) * n)
-        return words.get(int(fate[r])) or ("a train leaves the line" if off[of].any() else left[bool(changed[of].any())])
 
-    return tuple(why(r) for r in range(len(stack.runs)))
+@bare
+def _changed(ways: Ways, track: Ints, before: Ints, now: Ints, changed: Bools) -> None:
+    """Mark trains that have changed track from one row to another; ``track`` (E,) is that of every edge."""
+    for i in range(len(now)):
+        for k in range(before[i], now[i]):
+            if track[ways.edge[k]] != track[ways.edge[k + 1]]:
+                changed[i] = True
