@@ -277,7 +277,7 @@ class Model:
         """Minimum and maximum speed of a convoy's reference that the law takes [m/s]; infinite where there are no convoys."""
         return speed_band(self) if not self.placed and self.roster.cooperates.sum() > 1 else (-math.inf, math.inf)
 
-    @property
+    @cached_property
     def remembers(self) -> bool:
         """Whether the sampled law keeps a state of its own from one control instant to the next."""
         return self.sampled and hasattr(self.law, "initial")
