@@ -41,7 +41,7 @@ References
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -244,20 +244,25 @@ def violations(params: Params, scene: Scene) -> list[str]:
     return found
 
 
-def _per_train(scene: Scene, bad: Bools, texts: list[str]) -> Iterator[str]:
-    """One line for all trains if they all fail alike, else one line per train."""
-    if len(texts) > 1 and bad.all() and len(set(texts)) == 1:
+def _per_train(scene: Scene, bad: Bools, text: Callable[[int], str]) -> Iterator[str]:
+    """One line for all trains if they all fail alike, else one line per train; ``text`` is that of a train."""
+    texts = {i: text(i) for i in np.flatnonzero(bad).tolist()}
+    if 1 < len(texts) == len(bad) and len(set(texts.values())) == 1:
         yield f"bounds.{texts[0]}"
         return
-    for i in np.flatnonzero(bad).tolist():
-        yield f"train[{scene.trains[i]}].{texts[i]}"
+    for i, words in texts.items():
+        yield f"train[{scene.trains[i]}].{words}"
 
 
 def _speed_violations(scene: Scene) -> Iterator[str]:
     """v_i(0) in its band, Assumptions 2.3 and 2.4."""
     rho, Rho = scene.bounds.speed_lower, scene.bounds.speed_upper
+
+    def unbounded(key: str, value: Floats) -> Callable[[int], str]:
+        return lambda i: f"{key} = {value[i]:g}: needs a finite bound (Assumption 2.3)"
+
     for key, value in (("speed_lower_mps", rho), ("speed_upper_mps", Rho)):
-        yield from _per_train(scene, ~np.isfinite(value), [f"{key} = {u:g}: needs a finite bound (Assumption 2.3)" for u in value])
+        yield from _per_train(scene, ~np.isfinite(value), unbounded(key, value))
     if not np.isfinite([rho, Rho]).all():
         return
 
@@ -269,8 +274,13 @@ def _speed_violations(scene: Scene) -> Iterator[str]:
             yield f"train[{name}].speed_mps = {v[i]:.10g}: above speed_upper_mps = {Rho[i]:.10g}"
 
     slow, fast = _speed_range(scene.reference, scene.time)
-    low = [f"speed_lower_mps = {u:.10g}: must be below the reference speed {slow:.10g} m/s (Assumption 2.3)" for u in rho]
-    high = [f"speed_upper_mps = {u:.10g}: must be above the reference speed {fast:.10g} m/s (Assumption 2.3)" for u in Rho]
+
+    def low(i: int) -> str:
+        return f"speed_lower_mps = {rho[i]:.10g}: must be below the reference speed {slow:.10g} m/s (Assumption 2.3)"
+
+    def high(i: int) -> str:
+        return f"speed_upper_mps = {Rho[i]:.10g}: must be above the reference speed {fast:.10g} m/s (Assumption 2.3)"
+
     yield from _per_train(scene, rho >= slow, low)
     yield from _per_train(scene, Rho <= fast, high)
     yield from _input_violations(scene, slow, fast)
@@ -303,9 +313,8 @@ def _input_violations(scene: Scene, slow: float, fast: float) -> Iterator[str]:
         span = f"from {rho[i]:.10g} to {fast:.10g} m/s within one control period of {T:.10g} s"
         return f"{key}: must be above {need:.6g} to speed up {span}{cure} (Assumption 2.4)"
 
-    trains = range(len(scene.trains))
-    yield from _per_train(scene, ~brakes | (Rho - slow >= (f - mu) * T), [to_brake(i) for i in trains])
-    yield from _per_train(scene, ~pulls | (fast - rho >= (Mu - F) * T), [to_pull(i) for i in trains])
+    yield from _per_train(scene, ~brakes | (Rho - slow >= (f - mu) * T), to_brake)
+    yield from _per_train(scene, ~pulls | (fast - rho >= (Mu - F) * T), to_pull)
 
 
 def _speed_range(reference: Reference, time: float) -> tuple[float, float]:
@@ -348,7 +357,7 @@ def _link_violations(scene: Scene) -> Iterator[str]:
         if back is None:
             mutual = False
             yield f"{name}: train {scene.trains[j]} must receive from train {scene.trains[i]} too, this law needs links both ways"
-        elif not np.allclose((d, lower, upper), (-links.desired[back], -links.upper[back], -links.lower[back]), 0.0, ROUNDING):
+        elif not _close((d, lower, upper), (-links.desired[back], -links.upper[back], -links.lower[back])):
             yield f"{name}: desired_m, lower_m and upper_m must be the same both ways with the sign changed (Assumption 2.2)"
         if links.weight[row] != 1.0:
             yield f"{name}.weight = {links.weight[row]:.10g}: this law has no weights, only 1"
@@ -360,6 +369,11 @@ def _link_violations(scene: Scene) -> Iterator[str]:
             yield f"{name}.lower_m = {lower:.10g}: spacing is front to front, and train {scene.trains[j]} is {length[j]:.10g} m"
     if mutual:
         yield from _cycle_violations(scene)
+
+
+def _close(some: tuple[float, ...], others: tuple[float, ...]) -> bool:
+    """Whether numbers are the same but for rounding; infinite ones may be."""
+    return all(a == b or abs(a - b) <= ROUNDING for a, b in zip(some, others, strict=True))
 
 
 def _cycle_violations(scene: Scene) -> Iterator[str]:
