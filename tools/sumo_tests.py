@@ -195,8 +195,10 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"{given.folder}: no *.sumocfg in it", file=sys.stderr)
         return 2
     with ThreadPoolExecutor(given.jobs) as pool:
-        ran = LAW | (OBEY if given.obey else {})
-        found = list(pool.map(lambda path: case(path.resolve(), given.folder.resolve(), ran), files))
+        ran, found = LAW | (OBEY if given.obey else {}), []
+        for row in pool.map(lambda path: case(path.resolve(), given.folder.resolve(), ran), files):
+            found.append(row)
+            print(f"{len(found)} of {len(files)}: {row['case']}", file=sys.stderr)
     print(json.dumps(found, indent=1) if given.json else table(found))
     complaints = [line for row in found for line in wrong(row)]
     print(*complaints, sep="\n", file=sys.stderr)
