@@ -146,6 +146,8 @@ def alike(one: Instant, other: Instant) -> bool:
 
 def together(instants: Sequence[Instant]) -> Instant:
     """Several instants that are ``alike`` as one with a leading axis."""
+    if len(instants) == 1:  # of many trains, which need not be copied
+        return Instant._make(np.asarray(part)[None] for part in instants[0])
     return Instant._make(map(np.array, zip(*instants, strict=True)))
 
 
@@ -169,8 +171,9 @@ def units(now: Instant, consists: Consists) -> Units:
 
 
 def _of(values: Floats, trains: Ints) -> Floats:
-    """Values of these trains, at every instant."""
-    return np.take_along_axis(values, trains, -1)
+    """Values (K, n) of these trains (K, m), at every instant; any value where a train is -1."""
+    begin = values.shape[1] * np.arange(len(values))[:, None]
+    return values.reshape(-1)[trains + begin if len(values) > 1 else trains]
 
 
 def finite(values: Floats) -> Floats:

@@ -128,8 +128,10 @@ class Journal:
     def _append(self, table: str, now: columns.Instant, kept: Bools, numbers: Mapping[str, Any]) -> None:
         """Append the rows that are ``kept`` (K, rows) of ``numbers`` (K, rows) or (rows,), instant after instant."""
         if kept.any():
+            rows = slice(None) if kept.all() else np.flatnonzero(kept)
             numbers = {"time_s": np.asarray(now.time)[:, None], **numbers}
-            self.recorder.write(table, **{name: np.broadcast_to(number, kept.shape)[kept] for name, number in numbers.items()})
+            each = {name: part if part.shape == kept.shape else np.broadcast_to(part, kept.shape) for name, part in numbers.items()}
+            self.recorder.write(table, **{name: part.reshape(-1)[rows] for name, part in each.items()})
 
     def call(self, train: int, call: columns.Call, edge: int) -> None:
         """One row of the stops: a train that has left one, or that comes no more before the end of the run."""
