@@ -13,6 +13,7 @@ import tomli_w
 
 import trainctl
 from trainctl.errors import InputError, SimulatorError
+from trainctl.sumo.session import Sumo
 
 SHORT = {"run.duration_s": 48}
 
@@ -274,6 +275,19 @@ def test_three_threads_run_at_once_or_are_told_and_the_next_run_is_as_ever(backe
         "SUMO already runs in this process; it can hold one simulation at a time"
     }
     assert run_in("after") == alone
+
+
+def test_who_looked_for_sumo_before_another_run_began_does_not_take_it_away(tmp_path, monkeypatch):
+    """Two threads may both find none running, and then start theirs one after the other."""
+    with trainctl.Simulation.open("fully_distributed", out=tmp_path / "first", **{"run.duration_s": 24}) as first:
+        first.step(3)
+        looked = Sumo._ready
+        seen: list[None] = []
+        monkeypatch.setattr(Sumo, "_ready", lambda self: looked(self) if seen else seen.append(None))
+        with pytest.raises(SimulatorError, match="already runs in this process"):
+            trainctl.run("fully_distributed", out=tmp_path / "second", **{"run.duration_s": 24})
+        first.step(21)
+        assert first.done
 
 
 def test_an_error_in_the_users_loop_marks_the_run_as_failed(tmp_path):

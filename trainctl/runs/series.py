@@ -107,8 +107,6 @@ def _numbered(whole: NDArray[Any]) -> Names:
 
 def series(table: pa.Table, *keys: str) -> Series:
     """Split a table by the values of ``keys`` (joined by a dot in the names) and sort each part by time."""
-    if not table.num_rows:
-        return Series([], np.zeros(1, dtype=np.int64), {})
     numbers, words = dict[str, NDArray[Any]](), dict[str, Names]()
     for name in table.column_names:
         kind = table[name].type
@@ -116,6 +114,8 @@ def series(table: pa.Table, *keys: str) -> Series:
             words[name] = coded(table[name])
         else:
             numbers[name] = in_numpy(table[name])
+    if not table.num_rows:
+        return Series([], np.zeros(1, dtype=np.int64), numbers, words)
     return _split(numbers, words, [words[key] if key in words else coded(table[key]) for key in keys])
 
 
@@ -171,6 +171,10 @@ class Pairs(Series):
     ends: list[tuple[str, str]] = field(default_factory=list)
 
 
+#: The columns of ``pairs``.
+PAIRED = ("time_s", "spacing_m", "desired_m", "lower_m", "upper_m", "error_m", "age_s")
+
+
 def pairs(links: pa.Table) -> Pairs:
     """Links as one series per pair ``ahead-behind``, whichever receives from which.
 
@@ -179,7 +183,7 @@ def pairs(links: pa.Table) -> Pairs:
     ``age_s``, the time since the link was made or its desired spacing or bounds were changed.
     """
     if not links.num_rows:
-        return Pairs([], np.zeros(1, dtype=np.int64), {})
+        return Pairs([], np.zeros(1, dtype=np.int64), dict.fromkeys(PAIRED, np.zeros(0)))
     stated = {name: in_numpy(links[name]) for name in ("time_s", "spacing_m", "desired_m", "lower_m", "upper_m")}
     flip = stated["desired_m"] < 0
     sign = np.where(flip, -1.0, 1.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import sys
+import threading
 from collections import deque
 from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
@@ -35,6 +36,9 @@ NEAR_M = 1e-3
 
 #: Closer than this to the end of its edge, or beyond, SUMO plans the step.
 PLANNED_M = 1.0
+
+#: Held while SUMO is started: of two threads that both found none running, the second took the simulation of the first one away.
+STARTING = threading.Lock()
 
 #: Flag of a stop that a train parks at.
 PARKING = 1
@@ -93,7 +97,9 @@ class Session:
             raise SimulatorError("SUMO already runs in this process; it can hold one simulation at a time")
 
     def _launch(self, options: list[str]) -> None:
-        libsumo.start(["sumo", *options])
+        with STARTING:
+            self._ready()
+            libsumo.start(["sumo", *options])
 
     def _begin(self, configuration: Path) -> None:
         """Start SUMO, which then has its first trains on the net."""
