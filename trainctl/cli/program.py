@@ -170,10 +170,9 @@ def check(name: ScenarioName = DEFAULT_SCENARIO, settings: Settings = None, as_j
     for row in in_words(found):
         fill(table, *row)
     show(table)
-    for k, line in enumerate(found.get("promise", ())):
-        say(f"protection: {line}" if not k else f"  - {line}")
-    for k, line in enumerate(found["followed"]):
-        say(f"followed of SUMO's files: {line}" if not k else f"  - {line}")
+    for title, lines in (("protection", found.get("promise", ())), ("followed of SUMO's files", found["followed"])):
+        for k, line in enumerate(lines):
+            say(f"  - {line}" if k else f"{title}: {line}")
     for line in found["report"]:
         say(line)
     for line in found["warnings"]:

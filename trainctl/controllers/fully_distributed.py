@@ -186,7 +186,7 @@ def _admitted(
     constants: Constants, own: Trains, place: Floats, wanted: Floats, links: Links, heard: Floats, acceleration: Floats,
     saturated: Bools,
 ) -> None:  # fmt: skip
-    """Write what (10) to (12) give every train. What is not a number is passed on: a message's by G, a train's own by its speed."""
+    """Write what (10) to (12) give every train. What is not a number is passed on."""
     c, T = constants, constants.period
     for i in range(len(wanted)):
         v, v_r = own.speed[i], wanted[i]
@@ -216,8 +216,9 @@ def _admitted(
         else:
             eta = c.Rho[i] * T + (c.mu[i] - c.f[i]) * (T * T) - v_r * T
             Eta = c.rho[i] * T + (c.Mu[i] - c.F[i]) * (T * T) - v_r * T
-        delta, Delta = max(alpha, max(beta, eta)), min(Alpha, min(Beta, Eta))
-        s = Delta if Delta <= G else max(G, delta)
+        # Numpy's pass on what is not a number: a train without a resistance must not go on as if its input had no bounds.
+        delta, Delta = np.maximum(alpha, np.maximum(beta, eta)), np.minimum(Alpha, np.minimum(Beta, Eta))
+        s = Delta if Delta <= G else np.maximum(G, delta)
         saturated[i] = s != G and not hold
         if hold:
             s = 0.0

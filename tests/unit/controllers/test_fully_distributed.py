@@ -269,3 +269,13 @@ def test_a_reference_that_will_leave_the_band_is_seen_at_the_start() -> None:
 def test_keys_are_checked(keys: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         law.Params.model_validate(keys)
+
+
+@pytest.mark.parametrize("known", ["position", "speed", "resistance"])
+def test_what_is_no_number_does_not_pass_for_one(known: str) -> None:
+    """A train that does not know its resistance must not go on as if its input had no bounds: who checks the demand stops the run."""
+    sc = scene(LEGAL, PAIR)
+    trains, constants = sense(sc), law.constants(law.Params(eta="own_speed"), sc)
+    getattr(trains, known)[1] = np.nan
+    heard = law.message(constants, trains, LEADER)[sc.links.sender]
+    assert np.isnan(law.demand(constants, trains, LEADER, sc.links, heard).acceleration[1])
