@@ -16,6 +16,12 @@ from sumo_net.netfile import NetFile
 #: Why what is not known here is not followed.
 UNKNOWN = "it is not known here"
 
+#: The same of what would have trains rerouted, and of how SUMO's own drivers drive.
+KEEP_ROUTES, DRIVEN = "trains keep their routes", "train type and law of the scenario drive the train"
+
+#: How params begin that give a train a device for rerouting.
+REROUTING_PARAMS = ("has.rerouting.device", "device.rerouting.")
+
 
 class Refused(NamedTuple):
     """Why a configuration with this in it is not run."""
@@ -158,7 +164,7 @@ NAMED: Mapping[tuple[str, str], tuple[str, frozenset[str]] | Refused] = {
             "insertionChecks": ("a train enters when it can do so safely", _words("all")),
             "departLane": ("trains begin on a lane that allows them and leads on", _words("0 first free allowed best best_prob")),
             "arrivalLane": ("trains arrive on any lane", _words("current first")),
-            "reroute": ("trains keep their routes", OFF),
+            "reroute": (KEEP_ROUTES, OFF),
             "fromTaz": ("trips between zones have no route here", frozenset()),
             "toTaz": ("trips between zones have no route here", frozenset()),
         }.items()
@@ -178,7 +184,7 @@ NAMED: Mapping[tuple[str, str], tuple[str, frozenset[str]] | Refused] = {
     ("parkingArea", "onRoad"): ("a train that stops there leaves the track", OFF),
     ("vType", "scale"): ("every train of it comes once", _words("1 1.0 1.00")),
     **{
-        ("vType", key): ("train type and law of the scenario drive the train", frozenset[str]())
+        ("vType", key): (DRIVEN, frozenset[str]())
         for key in ("accel", "emergencyDecel", "apparentDecel", "tau", "sigma", "minGap", "speedDev", "actionStepLength",
                     "desiredMaxSpeed", "startupDelay", "impatience", "timeToTeleport", "curveResistance")
     },
@@ -229,7 +235,7 @@ NET_CONNECTION = _words(
 
 
 #: The same of options whose names begin so.
-OPTIONS_NAMED_FROM = {"device.rerouting.": ("trains keep their routes", OFF)}
+OPTIONS_NAMED_FROM = {"device.rerouting.": (KEEP_ROUTES, OFF)}
 
 
 def of_options(options: Mapping[str, str]) -> Said:
@@ -273,7 +279,13 @@ def of_trains(elements: Iterable[Element]) -> Said:
 def _of_one(element: Element) -> Iterator[tuple[str, str, str | Refused | None]]:
     """Element, attribute, and why it is not followed (None: it is) of all that one element says of the run of a train."""
     tag = element.tag
-    if tag == "param" or tag.startswith("carFollowing-"):
+    if tag == "param":  # what SUMO does not know is the user's own
+        key = element.get("key", "")
+        if key.startswith(REROUTING_PARAMS) and element.get("value", "") not in OFF:
+            yield tag, key, KEEP_ROUTES
+        return
+    if tag.startswith("carFollowing-"):
+        yield tag, "", DRIVEN
         return
     if tag not in ELEMENTS:
         yield tag, "", UNKNOWN

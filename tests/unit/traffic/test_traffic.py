@@ -325,6 +325,13 @@ def test_what_is_followed_is_listed(files: Files) -> None:
     assert said["<variableSpeedSign>"] == "1"
 
 
+def test_params_that_change_a_run_are_named_and_those_of_the_user_are_not(files: Files) -> None:
+    params = '<param key="has.rerouting.device" value="true"/><param key="colour of the doors" value="red"/>'
+    notes = files.read(f'{V} route="main">{params}</vehicle>').notes
+    assert "1 x <param has.rerouting.device>: not followed: trains keep their routes" in notes
+    assert not [note for note in notes if "doors" in note]
+
+
 def test_places_drawn_in_a_parking_area_are_nothing_to_follow(files: Files) -> None:
     area = '<parkingArea id="yard" lane="bc_0" startPos="0" endPos="90"><space x="5" y="5"/></parkingArea></additional>'
     traffic = files.read(
