@@ -240,6 +240,11 @@ def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, app
     a, last = constants.first[i], len(applied) - 1
     traction = braking = resistance = damping = climb = disturbance = 0.0
     pull = 0.0  # of the coupler before this unit
+    for j in range(last + 1):  # slopes and faults apart: their searches would keep the loop below from being unrolled
+        unit = constants.units[a + j]
+        out[j, SPEED] = unit[SLOPE] + slope_at(own[j, POSITION], constants.gradient)
+        fault = fault_rate(constants.faults, a + j, t, inside) + unit[INERTIA] * unit[NOISE]
+        out[j, FORCE] = unit[RATE] * (effectiveness(constants.faults, a + j, inside) * applied[j] - own[j, FORCE]) + fault
     for j in range(last + 1):
         unit = constants.units[a + j]
         v, tau = own[j, SPEED], own[j, FORCE]
@@ -249,15 +254,13 @@ def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, app
             rear = unit[STIFFNESS] * (own[j, POSITION] - own[j + 1, POSITION] - unit[LENGTH]) + unit[DAMPING] * closing
             damping += unit[DAMPING] * closing * closing
         drag = unit[MASS] * running_resistance(v, unit[C0], unit[C1], unit[C2])
-        weight = unit[MASS] * GRAVITY * (unit[SLOPE] + slope_at(own[j, POSITION], constants.gradient))
+        weight = unit[MASS] * GRAVITY * out[j, SPEED]
         push = unit[MASS] * unit[PUSH]
         acceleration = (tau + pull - rear - drag - weight + push) / unit[INERTIA]
-        fault = fault_rate(constants.faults, a + j, t, inside) + unit[INERTIA] * unit[NOISE]
         out[j, POSITION] = v
         if v <= 0.0:  # whoever moves off meets the resistance of motion: without it a unit would start and stop for ever
             acceleration = max(acceleration - unit[MASS] * unit[C0] / unit[INERTIA], -HOLD * v)
         out[j, SPEED] = acceleration
-        out[j, FORCE] = unit[RATE] * (effectiveness(constants.faults, a + j, inside) * applied[j] - tau) + fault
         traction += max(tau * v, 0.0)
         braking += max(-tau * v, 0.0)
         resistance += drag * v

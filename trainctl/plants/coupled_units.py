@@ -191,6 +191,8 @@ def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, app
     units, gradient = constants.units, constants.gradient
     traction = braking = resistance = damping = climb = disturbance = 0.0
     pull = 0.0  # f(e_{j-1}): the coupler before this unit, stretched positive
+    for j in range(last + 1):  # slopes apart: their search would keep the loop below from being unrolled
+        out[j, SPEED] = units[a + j, SLOPE] + slope_at(own[j, POSITION], gradient)
     for j in range(last + 1):
         row = a + j
         v, u, m = own[j, SPEED], applied[j], units[row, MASS]
@@ -201,7 +203,7 @@ def rate(i: int, constants: Constants, t: float, inside: float, own: Floats, app
             f = units[row, STIFFNESS] * e + units[row, DAMPING] * de
             damping += units[row, DAMPING] * de * de
         drag = m * running_resistance(v, units[row, C0], units[row, C1], units[row, C2])
-        weight = m * GRAVITY * (units[row, SLOPE] + slope_at(own[j, POSITION], gradient))
+        weight = m * GRAVITY * out[j, SPEED]
         push = m * units[row, PUSH]
         acceleration = (u + pull - f - drag - weight + push) * units[row, PER_INERTIA]
         out[j, POSITION] = v
