@@ -47,30 +47,30 @@ def seen(exchanged: Exchanged, width: int) -> Floats:
     instant; by how much that, less what the own train says, is off the desired spacing; the other numbers of the message, less
     what the own train says. A message is the law's own, as its module tells, and the last one stays until a newer one comes.
     """
-    trains, leader, messages = exchanged.trains, exchanged.leader, exchanged.messages
+    trains, leader, messages, links = exchanged.trains, exchanged.leader, exchanged.messages, exchanged.links
     out = np.empty((len(trains.speed), width))
     _see(
         trains.position - leader[POSITION], trains.speed, trains.speed - leader[SPEED], trains.resistance, exchanged.said,
-        exchanged.links, messages.heard, messages.ever, out,
+        links.first, links.desired, links.slot, links.heard, messages.heard, messages.ever, out,
     )  # fmt: skip
     return out
 
 
 @njit(cache=True)
 def _see(
-    place: Floats, speed: Floats, off: Floats, resistance: Floats, said: Floats, links: Links, heard: Floats, ever: Bools,
-    out: Floats,
+    place: Floats, speed: Floats, off: Floats, resistance: Floats, said: Floats, first: Ints, desired: Floats, slots: Floats,
+    came: Bools, heard: Floats, ever: Bools, out: Floats,
 ) -> None:  # fmt: skip
     words, own = said.shape[1], 4
     places = (out.shape[1] - own) // (1 + words)
     for i in range(len(place)):
-        slot = links.slot[i] if links.slot[i] == links.slot[i] else 0.0  # there are none
+        slot = slots[i] if slots[i] == slots[i] else 0.0  # there are none
         out[i, 0], out[i, 1], out[i, 2], out[i, 3] = place[i] - slot, off[i], speed[i], resistance[i]
         for j in range(places):
-            k, at = links.first[i] + j, own + j * (1 + words)
-            if k < links.first[i + 1] and ever[k]:
-                out[i, at] = 1.0 if links.heard[k] else 0.0
-                out[i, at + 1] = heard[k, 0] - said[i, 0] - links.desired[k]
+            k, at = first[i] + j, own + j * (1 + words)
+            if k < first[i + 1] and ever[k]:
+                out[i, at] = 1.0 if came[k] else 0.0
+                out[i, at + 1] = heard[k, 0] - said[i, 0] - desired[k]
                 for c in range(1, words):
                     out[i, at + 1 + c] = heard[k, c] - said[i, c]
             else:
@@ -78,21 +78,28 @@ def _see(
                     out[i, at + c] = 0.0
 
 
-@njit(cache=True)
-def judge(
-    links: Links, position: Floats, over: Bools, run: Ints, error: Floats, margin: Floats, touches: Bools
-) -> None:  # fmt: skip
-    """Write errors, margins and who touches, (N,) each, as in ``Judged``.
+def judge(links: Links, position: Floats, over: Bools, run: Ints) -> tuple[Floats, Floats, Bools]:
+    """Errors, margins and who touches, (N,) each, as in ``Judged``.
 
     ``over`` (R,) are the runs in which trains touched, ``run`` (N,) whose they are.
     """
+    error, margin, touches = np.empty(len(run)), np.empty(len(run)), np.empty(len(run), bool)
+    _judge(links.first, links.sender, links.desired, links.lower, links.upper, position, over, run, error, margin, touches)
+    return error, margin, touches
+
+
+@njit(cache=True)
+def _judge(
+    first: Ints, sender: Ints, desired: Floats, lower: Floats, upper: Floats, position: Floats, over: Bools, run: Ints,
+    error: Floats, margin: Floats, touches: Bools,
+) -> None:  # fmt: skip
     for i in range(len(position)):
         squares, least = 0.0, np.inf
-        for k in range(links.first[i], links.first[i + 1]):
-            spacing = position[links.sender[k]] - position[i]
-            squares += (spacing - links.desired[k]) ** 2
-            least = min(least, min(spacing - links.lower[k], links.upper[k] - spacing))
-        count = links.first[i + 1] - links.first[i]
+        for k in range(first[i], first[i + 1]):
+            spacing = position[sender[k]] - position[i]
+            squares += (spacing - desired[k]) ** 2
+            least = min(least, min(spacing - lower[k], upper[k] - spacing))
+        count = first[i + 1] - first[i]
         error[i] = np.sqrt(squares / count) if count > 0 else 0.0
         margin[i], touches[i] = least, over[run[i]]
 

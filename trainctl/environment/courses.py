@@ -292,16 +292,14 @@ class Agents:
             raise InputError(f"action of agent {self.names[wrong]} = {actions[wrong]}: must be finite")
         course.go_on(*((given, None) if self.asked.acts == "acceleration" else (None, given)))
         now = course.now()
-        n = len(now.speed)
-        error, margin, touches = np.empty(n), np.empty(n), np.empty(n, bool)
-        judge(now.links, now.position, course.over, course.run, error, margin, touches)
+        error, margin, touches = judge(now.links, now.position, course.over, course.run)
         acceleration = (now.speed - self.speed) / self.period
         judged = Judged(error, now.speed - now.exchanged.leader[SPEED], acceleration, margin, touches)
         sight, reward = self._seen(now.exchanged), self.asked.reward(judged)
         if self.ended.any():
             sight[self.ended], reward = 0.0, np.where(self.ended, 0.0, reward)
         self.speed, self.ended = now.speed, self.ended | touches | now.left
-        return Outcome(sight, reward, self.ended, np.full(n, course.done), judged)
+        return Outcome(sight, reward, self.ended, np.full(len(now.speed), course.done), judged)
 
     def _seen(self, exchanged: Exchanged) -> Floats:
         if exchanged.links.first is not self.first:

@@ -63,14 +63,6 @@ class Radio(NamedTuple):
         return out
 
 
-class Brought(NamedTuple):
-    """What links have brought, as ``Messages`` has it."""
-
-    heard: Floats  # (L, w)
-    ever: Bools  # (L,)
-    newest: Ints  # (L,)
-
-
 def silent() -> Messages:
     """Nothing sent, nothing received."""
     none = np.zeros(0, np.int64)
@@ -132,20 +124,19 @@ def deliver(
     under_way = (*messages.sent, sent)[-radio.oldest - 1 :]
     who = (*messages.spoke, spoke)[-radio.oldest - 1 :]
     reaches = reach(position, links, radio.radius) if math.isfinite(radio.radius) else np.zeros(0, bool)
-    before = Brought(heard, ever, newest)
-    after = Brought(np.empty_like(heard), np.empty(rows, bool), np.empty(rows, np.int64))
+    now_heard, now_ever, now_newest = np.empty_like(heard), np.empty(rows, bool), np.empty(rows, np.int64)
     arrives = np.empty(rows, bool)
     if radio.turns_bad > 0.0:
         bad = bad.copy()
     came = _arrive(
         radio.loss, radio.bad_loss, radio.turns_bad, radio.turns_good, radio.delay, radio.spread, radio.exponential, radio.key,
-        radio.names, links.sender, links.receiver, count, _oldest_first(under_way), _oldest_first(who), out, reaches, before, bad,
-        after, arrives,
+        radio.names, links.sender, links.receiver, count, _oldest_first(under_way), _oldest_first(who), out, reaches, bad,
+        heard, ever, newest, now_heard, now_ever, now_newest, arrives,
     )  # fmt: skip
     counted = messages.counted.copy()
     counted[0] += np.count_nonzero(spoke)
     counted[1] += came
-    return Messages(under_way, after.heard, after.ever, after.newest, bad, who, said, quiet, counted), arrives
+    return Messages(under_way, now_heard, now_ever, now_newest, bad, who, said, quiet, counted), arrives
 
 
 def _oldest_first(rows: Sequence[Any]) -> Any:
@@ -170,10 +161,13 @@ def _who_sends(radio: Radio, messages: Messages, place: Floats, out: Bools) -> t
 @bare
 def _arrive(
     loss: float, bad_loss: float, turns_bad: float, turns_good: float, delay: int, spread: float, exponential: bool, key: Ints,
-    names: Ints, sender: Ints, receiver: Ints, count: int, sent: Floats, spoke: Bools, out: Bools, reaches: Bools, before: Brought,
-    bad: Ints, after: Brought, arrives: Bools,
+    names: Ints, sender: Ints, receiver: Ints, count: int, sent: Floats, spoke: Bools, out: Bools, reaches: Bools, bad: Ints,
+    heard: Floats, ever: Bools, newest: Ints, now_heard: Floats, now_ever: Bools, now_newest: Ints, arrives: Bools,
 ) -> int:  # fmt: skip
     """Write what each link has brought by now, and whether it brings something now (L,); how many do. ``bad`` goes on in place.
+
+    ``heard``, ``ever`` and ``newest`` are what it had brought before, as ``Messages`` has them: single arrays, since to hand over a
+    tuple of them takes as long as all that is done here.
 
     ``sent`` (D, n, w) is what was said in the last D exchanges, oldest first, and ``spoke`` (D, n) who did send it. ``reaches`` may
     be empty: all do.
@@ -183,7 +177,7 @@ def _arrive(
     sure = depth == 1 and delay == 0 and not draws_any and len(reaches) == 0 and not out.any() and spoke.all()
     for k in range(len(sender)):
         s, r = sender[k], receiver[k]
-        lost, age, newest = loss, -1, before.newest[k]
+        lost, age, last = loss, -1, newest[k]
         if turns_bad > 0.0:
             turn, begin = draws.uniforms(count, draws.BURST, names[s], names[r], key[r, 0], key[r, 1])
             if bad[k] < 0:
@@ -192,12 +186,12 @@ def _arrive(
                 bad[k] = turn >= turns_good if bad[k] else turn < turns_bad
             lost = bad_loss if bad[k] else loss
         if sure:  # all links bring what is said now
-            if count > newest:
-                age, newest = 0, count
+            if count > last:
+                age, last = 0, count
         elif not (out[s] or out[r]) and (len(reaches) == 0 or reaches[k]):
             for a in range(delay, depth):
                 number = count - a
-                if number <= newest:
+                if number <= last:
                     break
                 if not spoke[depth - 1 - a, s]:
                     continue
@@ -211,14 +205,14 @@ def _arrive(
                         continue
                 elif takes != a:
                     continue
-                age, newest = a, number
+                age, last = a, number
                 break
-        after.newest[k], arrives[k], after.ever[k] = newest, age >= 0, before.ever[k] or age >= 0
+        now_newest[k], arrives[k], now_ever[k] = last, age >= 0, ever[k] or age >= 0
         if age >= 0:
             came += 1
             for c in range(sent.shape[2]):
-                after.heard[k, c] = sent[depth - 1 - age, s, c]
+                now_heard[k, c] = sent[depth - 1 - age, s, c]
         else:
             for c in range(sent.shape[2]):
-                after.heard[k, c] = before.heard[k, c]
+                now_heard[k, c] = heard[k, c]
     return came
