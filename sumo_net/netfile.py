@@ -49,7 +49,8 @@ class NetFile(NamedTuple):
     connections: list[dict[str, str]]
     junctions: list[NetJunction]
     version: str  # of the format; "" if it says none
-    others: list[str]  # tags of all other elements
+    others: list[str]  # tags of all other elements, those in edges and lanes among them
+    restrictions: dict[str, dict[str, str]]  # by type of edge: speed limits of vehicle classes [m/s]
 
 
 def content(path: Path) -> bytes:
@@ -87,15 +88,16 @@ def read_net(path: Path) -> NetFile:
     LineError
         If there is no such file, it cannot be read, or it is not a net.
     """
-    net = NetFile([], [], [], "", [])
+    net = NetFile([], [], [], "", [], {})
     inside: NetEdge | NetJunction | None = None
+    kind = ""
     depth = 0
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal net, inside, depth
+        nonlocal net, inside, depth, kind
         depth += 1
         if depth == 2:
-            inside = None
+            inside, kind = None, ""
             if tag == "connection":
                 net.connections.append(attributes)
             elif tag == "edge":
@@ -104,11 +106,18 @@ def read_net(path: Path) -> NetFile:
                 net.junctions.append(inside := NetJunction(attributes, []))
             else:
                 net.others.append(tag)
+                kind = attributes.get("id", "") if tag == "type" else ""
+        elif depth == 3 and kind and tag == "restriction":
+            net.restrictions.setdefault(kind, {})[attributes.get("vClass", "")] = attributes.get("speed", "")
+        elif depth == 4 and isinstance(inside, NetEdge) and tag != "param":
+            net.others.append(tag)
         elif depth == 3 and inside is not None:
             if tag == "lane" and isinstance(inside, NetEdge):
                 inside.lanes.append(attributes)
             elif tag == "param" and isinstance(inside, NetEdge):
                 inside.params[attributes.get("key", "")] = attributes.get("value", "")
+            elif isinstance(inside, NetEdge):
+                net.others.append(tag)
             elif tag == "request" and isinstance(inside, NetJunction):
                 inside.requests.append(attributes)
         elif depth == 1:

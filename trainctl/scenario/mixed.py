@@ -202,10 +202,13 @@ def constraints(
     return found, wrong
 
 
-def unkept(elements: Sequence[Element], signals: Sequence[Signal], trips: Collection[str]) -> tuple[list[str], list[str]]:
+def unkept(
+    elements: Sequence[Element], signals: Sequence[Signal], trips: Collection[str], later: Collection[str]
+) -> tuple[list[str], list[str]]:
     """Constraints of the user's files at signals that are not there, which SUMO refuses; and of trains that do not come.
 
-    ``trips`` is what constraints call the trains. Returns mistakes and notes, one line each.
+    ``trips`` is what constraints call the trains, ``later`` what stops would have trains of ours called from there on. Returns
+    mistakes and notes, one line each.
     """
     names, wrong, notes = {one.name for one in signals}, [], []
     for given in (e for e in elements if e.tag == "railSignalConstraints"):
@@ -214,6 +217,8 @@ def unkept(elements: Sequence[Element], signals: Sequence[Signal], trips: Collec
         for one in given:
             wrong += [f"{who}: {one.tag}: tl = {one.get('tl')}: no such rail signal"] if one.get("tl", "") not in names else []
             foes = [foe for foe in one.get("foes", "").split() if foe not in trips]
+            renamed = [trip for trip in (one.get("tripId", ""), *foes) if trip in later and trip not in trips]
+            notes += [f"{who}: {one.tag}: {trip}: not followed: no stop gives a train another tripId" for trip in renamed]
             if foes and one.get("tripId") in trips:
                 notes.append(f"{who}: {one.tag}: {', '.join(foes)}: no such train: {one.get('tripId')} waits for it for ever")
     return wrong, notes

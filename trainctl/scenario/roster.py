@@ -24,7 +24,7 @@ from trainctl.scenario.train_types import fitted, train_type
 from trainctl.signals import Bools, Floats, Ints
 from trainctl.traffic.choices import Choice
 from trainctl.traffic.closings import Closing
-from trainctl.traffic.handed import Handed, handed, read_back
+from trainctl.traffic.handed import Handed, handed, read_back, trips_of_stops
 from trainctl.traffic.known import of_signals
 from trainctl.traffic.rail_signals import Signal
 from trainctl.traffic.read import Configuration, Departure, read_traffic
@@ -270,7 +270,8 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
             ways, trips = dict(zip(ids, whole, strict=True)), dict(zip(ids, given.trips, strict=True))
             ordered, wrong = mixed.constraints(scenario.order, ways, trips, rails, traffic.signals)
             given = given._replace(additional=(*given.additional, *ordered))
-            bad, notes = mixed.unkept(traffic.source.elements.others, traffic.signals, given.trips)
+            later = trips_of_stops(traffic.source, [name for name, other in zip(ids, driven.tolist(), strict=True) if not other])
+            bad, notes = mixed.unkept(traffic.source.elements.others, traffic.signals, given.trips, later)
             found, told = [*found, *wrong, *bad], [*told, *notes, *mixed.of_formations(together, traffic.source.options)]
         else:
             size = np.array([types[d.kind].per_unit("unit_length_m").sum() for d in traffic.departures])

@@ -19,9 +19,7 @@ from trainctl.sumo.commanded_files import OPTIONS, fcd_period, normal
 from trainctl.traffic.files import named_files, read_options
 
 #: Options that are ours: what is written and shown, and who listens.
-OURS = re.compile(
-    r"output|log|^save-|gui|^start$|^quit-on-end$|^remote-port$|^num-clients$|^summary$|^tripinfo$|^netstate|warnings$"
-)
+OURS = re.compile(r"output|log|^save-|gui|^start$|^quit-on-end$|^remote-port$|^num-clients$|^netstate|warnings$")
 
 
 class Vehicle(NamedTuple):
@@ -151,7 +149,6 @@ def write_own_configuration(p: Model, net: str, folder: Path) -> Path:
         **fcd_period(p.scenario.run.record_every_s),
         **({} if block(p) == "files" else {"railsignal-moving-block": str(block(p) == "moving").lower()}),
     }  # fmt: skip
-    options.pop("end", None)
     return _written(options, folder)
 
 

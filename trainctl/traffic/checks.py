@@ -9,7 +9,7 @@ from xml.etree.ElementTree import Element
 from sumo_net.netfile import RAIL, NetFile
 from trainctl.errors import InputError
 from trainctl.traffic import known
-from trainctl.traffic.files import PEOPLE, PLACES, Elements, is_time, routes_of, types_of
+from trainctl.traffic.files import PEOPLE, PLACES, Elements, is_time, names_of, routes_of, types_of
 from trainctl.traffic.kinds import Kind
 from trainctl.traffic.places import NO_RAIL, Tracks, off_route, place_of, unconnected
 
@@ -46,6 +46,8 @@ def rail_trains(elements: Elements, kinds: dict[str, Kind]) -> tuple[list[Elemen
     for name in sorted(drawn & set(kinds)):
         if "(" in (text := kinds[name].attributes.get("speedFactor", "")):
             notes.append(f"vType {name}: speedFactor = {text}: its mean {kinds[name].speed_factor:g} for every train")
+        if kinds[name].speed_factor > 1.0:
+            notes.append(f"vType {name}: speedFactor = {text}: not followed: trains keep to the limits of their tracks")
     return trains, notes
 
 
@@ -77,7 +79,13 @@ def refuse(sumocfg: Path, net: Path, trains: list[Element], elements: Elements, 
         raise InputError(f"{net}: {NO_RAIL}")
     if not trains:
         raise InputError(f"{sumocfg}: no trains: no vehicle, trip or flow has a vType of a rail class ({', '.join(sorted(RAIL))})")
-    wrong = []
+    mixes = [*elements.drawn.values(), *(mix for t in trains for mix in t.iter("routeDistribution"))]
+    wrong = [
+        f"routeDistribution {mix.get('id') or 'of a train'}: route {name}: no such route"
+        for mix in mixes
+        for name, _ in names_of(mix)
+        if name not in elements.routes
+    ]
     seen = Counter(train.get("id", "") for train in trains)
     for train in trains:
         who = f"{'flow' if train.tag == 'flow' else 'train'} {train.get('id', '')}"
@@ -98,7 +106,8 @@ def refuse(sumocfg: Path, net: Path, trains: list[Element], elements: Elements, 
         wrong += [f"{who}: {p.wrong}" for p in own.values() if p.wrong]
         for route in routes:
             wrong += [f"{who}: {m}" for m in unconnected(route.get("edges", "").split(), tracks)]
-            stops = [*route.iter("stop"), *(s for s in train if s.tag == "stop")]
+            # Of several routes its own stops need to lie on the one that is drawn.
+            stops = [*route.iter("stop"), *(s for s in train if s.tag == "stop" and len(routes) == 1)]
             places = [own.get(id(s)) or place_of(s, elements, tracks) for s in stops]
             wrong += [f"{who}: {p.wrong}" for p in places if p.wrong]
             if not {"repeat", "departEdge", "arrivalEdge"} & {*route.keys(), *train.keys()} and not any(p.wrong for p in places):

@@ -15,7 +15,7 @@ from xml.etree.ElementTree import Element
 from sumo_net.build import program
 from sumo_net.spec import LineError
 from trainctl.errors import InputError
-from trainctl.traffic.files import PLACES, Elements, parse, seconds
+from trainctl.traffic.files import PLACES, Elements, by_name, names_of, parse, routes_of, seconds
 
 #: Seconds after which duarouter is taken for stuck.
 PATIENCE_S = 300.0
@@ -33,8 +33,8 @@ _TRAIN_KEYS = {
 }  # fmt: skip
 #: What it needs of a route.
 _ROUTE_KEYS = {"id", "edges", "probability", "repeat", "cycleTime", "refId"}
-#: What it needs of a stop.
-_STOP_KEYS = {"lane", "edge", "startPos", "endPos", "friendlyPos", "duration", "until", "arrival", "speed", "parking", *PLACES}
+#: What it needs of a stop; one that begins where it ends it would drop.
+_STOP_KEYS = {"lane", "edge", "endPos", "friendlyPos", "duration", "until", "arrival", "speed", "parking", *PLACES}
 
 
 def expand(
@@ -51,7 +51,7 @@ def expand(
     drawn = {id(r) for mix in elements.drawn.values() for r in mix}
     routes.extend(_route(r) for r in elements.routes.values() if id(r) not in drawn)
     for mix in elements.drawn.values():
-        routes.append(_mix(mix))
+        routes.append(_mix(mix, elements))
     for train in trains:
         # duarouter ends with an error at a flow that begins too late for it.
         if train.tag == "flow" and end is not None and "end" not in train.attrib and seconds(train.get("begin", "0")) >= end:
@@ -62,8 +62,12 @@ def expand(
                 bare.append(_stop(child))
             elif child.tag == "route":
                 bare.append(_route(child))
+            elif child.tag == "routeDistribution" and by_name(train):  # else the stops of all its routes would be the train's
+                routes.append(_mix(child, elements))
+                routes[-1].set("id", name := f"{train.get('id', '')}:routes")
+                bare.set("route", name)
             elif child.tag == "routeDistribution":
-                bare.append(_mix(child))
+                bare.append(_mix(child, elements))
         routes.append(bare)
     for name, element in (("stops.add.xml", more), ("elements.rou.xml", routes)):
         ElementTree.ElementTree(element).write(work / name, encoding="utf-8")
@@ -98,7 +102,7 @@ def expand(
         raise InputError(
             [f"duarouter: {line}" for line in done.stderr.splitlines() if line.startswith("Error")] or ["duarouter failed"]
         )
-    return [e for e in parse(made) if e.tag == "vehicle"]
+    return _stops_drawn([e for e in parse(made) if e.tag == "vehicle"], trains, elements)
 
 
 def _bare(element: Element, keys: set[str]) -> Element:
@@ -119,10 +123,56 @@ def _stop(stop: Element) -> Element:
     return bare
 
 
-def _mix(mix: Element) -> Element:
-    bare = _bare(mix, {"id", "routes", "probabilities", "last"})
-    bare.extend(_route(r) for r in mix.iter("route"))
+def _mix(mix: Element, elements: Elements) -> Element:
+    """A distribution with its routes in it: of routes that it only names duarouter draws each as often as the others."""
+    bare = _bare(mix, {"id", "last"})
+    bare.extend(_route(route) for route in mix.iter("route") if not route.get("refId"))
+    for name, chance in names_of(mix):
+        route = _route(elements.routes[name])
+        route.attrib.pop("id")
+        route.set("probability", chance)
+        bare.append(route)
+    if mix.get("id") or names_of(mix):  # it would give every train the stops of the first route
+        for route in bare:
+            route[:] = []
     return bare
+
+
+def _stops_drawn(made: list[Element], trains: list[Element], elements: Elements) -> list[Element]:
+    """The vehicles, those of a distribution with the stops of the route that was drawn, counted from the departure as in SUMO."""
+    mixed = {t.get("id", ""): t for t in trains if t.get("route") in elements.drawn or (by_name(t) and not t.get("route"))}
+    wrong = []
+    for vehicle in made if mixed else ():
+        name = vehicle.get("id", "")
+        train, route = mixed.get(name, mixed.get(name.rpartition(".")[0])), vehicle.find("route")
+        edges = "" if route is None else route.get("edges", "")
+        drawn = [] if train is None else [r for r in routes_of(train, elements) if _runs(r, edges)]
+        stops = list({ElementTree.tostring(s): None for s in (_stops_of(r) for r in drawn)})
+        if len(stops) > 1 or (stops and drawn[0].get("repeat", "0") != "0" and len(drawn[0])):
+            why = "repeated" if len(stops) == 1 else "several of the same edges"
+            wrong.append(f"train {name}: stops of routes in a distribution, {why}, are not followed; give each train its route")
+            continue
+        for k, stop in enumerate(_stops_of(drawn[0]) if drawn else ()):
+            if "until" in stop.attrib:
+                stop.set("until", repr(seconds(stop.get("until", "")) + float(vehicle.get("depart", "0"))))
+            vehicle.insert(k + 1, stop)
+    if wrong:
+        raise InputError(wrong)
+    return made
+
+
+def _runs(route: Element, edges: str) -> bool:
+    """Whether a train that runs over these edges may have drawn a route."""
+    repeat = route.get("repeat", "0")
+    once = route.get("edges", "").split()
+    return edges.split() in (once, once * (int(repeat) + 1 if repeat.isdecimal() else 1))
+
+
+def _stops_of(route: Element) -> Element:
+    """The stops of a route, as a whole."""
+    found = Element("stops")
+    found.extend(_stop(stop) for stop in route.iter("stop"))
+    return found
 
 
 def _told(words: str, tags: dict[str, str]) -> list[str]:

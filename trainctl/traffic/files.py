@@ -18,11 +18,34 @@ from trainctl.errors import InputError
 
 #: What SUMO calls one thing: the places a train can stop at.
 PLACES = ("trainStop", "busStop", "containerStop", "parkingArea", "chargingStation", "overheadWireSegment")
-#: Short names of options, and the long ones.
+#: Other names of options, each with the one that SUMO itself writes.
 _OPTIONS = {
-    "n": "net-file", "net": "net-file", "r": "route-files", "routes": "route-files", "a": "additional-files",
-    "additional": "additional-files", "b": "begin", "e": "end",
+    other: name
+    for name, others in {
+        "configuration-file": "c configuration", "save-configuration": "C save-config",
+        "save-configuration.relative": "save-config.relative", "save-commented": "save-template.commented",
+        "net-file": "n net", "route-files": "r routes", "additional-files": "a additional", "weight-files": "w weights",
+        "weight-attribute": "x measure", "human-readable-time": "H", "netstate-dump": "ndump netstate netstate-output",
+        "person-fcd-output": "person-fcd", "summary-output": "summary", "tripinfo-output": "tripinfo",
+        "personinfo-output": "personinfo", "vehroute-output": "vehroutes", "personroute-output": "personroutes",
+        "statistic-output": "statistics-output", "begin": "b", "end": "e", "route-steps": "s",
+        "railsignal-moving-block": "railsignal.moving-block", "default.carfollowmodel": "carfollow.model",
+        "device.rerouting.with-taz": "with-taz", "device.rerouting.threads": "routing-threads", "verbose": "v", "help": "?",
+        "version": "V", "xml-validation": "X", "no-warnings": "W suppress-warnings", "log": "l log-file",
+        "duration-log.disable": "no-duration-log", "duration-log.statistics": "t", "device.taxi.vclasses": "taxi.vclasses",
+        "device.fcd-replay.files": "device.fcd-replay.file", "meso-ignore-lanes-by-vclass": "meso.ignore-lanes.by-vclass",
+        "random": "abs-rand", "seed": "srand", "gui-settings-file": "g", "quit-on-end": "Q", "game": "G", "start": "S",
+        "delay": "d", "breakpoints": "B", "edgedata-files": "m data-files", "alternative-net-file": "N", "demo": "D",
+        "disable-textures": "T",
+    }.items()
+    for other in others.split()
 }  # fmt: skip
+#: The same of their beginnings and ends.
+_BEGIN = {
+    "vehroutes.": "vehroute-output.", "netstate.": "netstate-dump.", "netstate-output.": "netstate-dump.",
+    "dump-": "netstate-dump.", "device.routing.": "device.rerouting.", "person-device.routing.": "person-device.rerouting.",
+}  # fmt: skip
+_END = {".knownveh": ".explicit"}
 #: What SUMO passes over in a route file.
 ADDITIONAL = frozenset(("variableSpeedSign", "rerouter", "calibrator"))
 _TRAINS = ("vehicle", "trip", "flow")
@@ -61,11 +84,11 @@ class _Shallow(ElementTree.TreeBuilder):
         self.depth += 1
         if self.depth > DEEPEST:
             raise _Refused(f"has more than {DEEPEST} elements within each other")
-        return super().start(tag, attributes)
+        return super().start(str(tag).rpartition("}")[2], attributes)  # SUMO pays no heed to namespaces
 
     def end(self, tag: Any, /) -> Element:
         self.depth -= 1
-        return super().end(tag)
+        return super().end(str(tag).rpartition("}")[2])
 
     def doctype(self, *_: object) -> None:
         raise _Refused("declares a document type")
@@ -89,12 +112,33 @@ def parse(path: Path) -> Element:
 
 
 def read_options(sumocfg: Path) -> dict[str, str]:
-    """Options of a configuration, short names spelled out."""
+    """Options of a configuration by the names that SUMO itself writes."""
     root = parse(sumocfg)
     if root.tag not in ("configuration", "sumoConfiguration"):
         raise InputError(f"{sumocfg}: not a SUMO configuration: it begins with <{root.tag}>, not <sumoConfiguration>")
-    said = {e.tag: value for e in root.iter() if (value := e.get("value", e.get("v"))) is not None}
-    return {_OPTIONS.get(key, key): value for key, value in said.items()}
+    said: dict[str, str] = {}
+    wrong = []
+    for element in root.iter():
+        # SUMO takes the text of an element for its value, too.
+        value = element.get("value", element.get("v", (element.text or "").strip() or None))
+        if value is None:
+            continue
+        key = _named(element.tag)
+        wrong += [f"{sumocfg}: option {key} is given twice, which SUMO refuses; take one out"] if key in said else []
+        said[key] = value
+    if wrong:
+        raise InputError(wrong)
+    return said
+
+
+def _named(key: str) -> str:
+    """The name that SUMO itself writes of an option."""
+    key = _OPTIONS.get(key, key)
+    for begin, own in _BEGIN.items():
+        key = own + key.removeprefix(begin) if key.startswith(begin) else key
+    for end, own in _END.items():
+        key = key.removesuffix(end) + own if key.endswith(end) else key
+    return key
 
 
 def named_files(sumocfg: Path, options: dict[str, str], key: str) -> list[Path]:
@@ -153,6 +197,19 @@ def types_of(mix: Element) -> list[str]:
     return [e.get("id", e.get("refId", "")) for e in mix if e.tag == "vType"] + mix.get("vTypes", "").split()
 
 
+def names_of(mix: Element) -> list[tuple[str, str]]:
+    """Names of the routes in a distribution that stand elsewhere, each with how probable it is."""
+    chances = mix.get("probabilities", "").split()
+    found = [(name, chances[k] if k < len(chances) else "1") for k, name in enumerate(mix.get("routes", "").split())]
+    return found + [(r.get("refId", ""), r.get("probability", "1")) for r in mix.iter("route") if r.get("refId")]
+
+
+def by_name(train: Element) -> bool:
+    """Whether the route of a train stands elsewhere: times of its stops count from the departure."""
+    mix = train.find("routeDistribution")
+    return bool(train.get("route") or (mix is not None and names_of(mix)))
+
+
 def routes_of(train: Element, demand: Elements) -> list[Element]:
     """The routes a train is given, none for a trip."""
     own = [r for r in train.iter("route") if r.get("edges")]
@@ -160,9 +217,7 @@ def routes_of(train: Element, demand: Elements) -> list[Element]:
     mix = demand.drawn.get(name) if name else train.find("routeDistribution")
     if mix is not None:
         own = [r for r in mix if r.get("edges")]
-        own += [
-            demand.routes[n] for n in (*mix.get("routes", "").split(), *(r.get("refId", "") for r in mix)) if n in demand.routes
-        ]
+        own += [demand.routes[name] for name, _ in names_of(mix) if name in demand.routes]
     return own or ([demand.routes[name]] if name in demand.routes else [])
 
 

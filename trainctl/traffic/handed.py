@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
-from trainctl.traffic.files import Elements
+from trainctl.traffic.files import Elements, routes_of
 
 #: Options that are ours: files, times, what is written and shown, who listens, what trains may not be done to.
 _OURS = re.compile(
-    r"output|log|^save-|^load-|gui|^start$|^quit-on-end$|^remote-port$|^num-clients$|^summary$|^tripinfo$|^netstate|warnings$"
+    r"output|log|^save-|^load-|gui|^start$|^quit-on-end$|^remote-port$|^num-clients$|^netstate|warnings$"
     r"|-files?$|^begin$|^end$|^step-|^scale|^time-to-teleport|^collision|^device\.|^default\.action-step|^precision|internal-links$"
+    r"|^max-num|insert|^random-depart|^extrapolate|^keep-after|^lateral-|^lanechange"
 )
 
 #: Elements of additional files that signals go by, and those that trains of SUMO's own meet.
@@ -94,6 +95,13 @@ def _vehicle(made: Element, source: Element, edges: tuple[str, ...]) -> Element:
 
 def _trip(source: Element, name: str) -> str:
     return next((p.get("value", "") for p in source if p.tag == "param" and p.get("key") == "tripId"), name)
+
+
+def trips_of_stops(source: Source, ids: Sequence[str]) -> set[str]:
+    """What stops of trains ``ids`` would have them called from there on."""
+    given = [source.vehicles[name][1] for name in ids]
+    elements = [element for train in given for element in (train, *routes_of(train, source.elements))]
+    return {stop.get("tripId", "") for element in elements for stop in element.iter("stop")} - {""}
 
 
 def _like(element: Element, attributes: Mapping[str, str]) -> Element:

@@ -7,20 +7,26 @@ followed is listed as well: who reads the list need not trust silence.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 from sumo_net.netfile import NetFile
+from trainctl.traffic.files import bad_number
 
 #: Why what is not known here is not followed.
 UNKNOWN = "it is not known here"
 
-#: The same of what would have trains rerouted, and of how SUMO's own drivers drive.
+#: The same of what would have trains rerouted, of how SUMO's own drivers drive, and of what SUMO may fit a train with.
 KEEP_ROUTES, DRIVEN = "trains keep their routes", "train type and law of the scenario drive the train"
+NO_DEVICE = "trains have no such device"
 
-#: How params begin that give a train a device for rerouting.
-REROUTING_PARAMS = ("has.rerouting.device", "device.rerouting.")
+#: Params that SUMO reads of a train or a type, beside those of devices: how they begin, and why they are not followed.
+PARAMS_NAMED = {
+    "junctionModel.ignore": "no train is overlooked",
+    "carFollowModel.ignore": "no train is overlooked",
+    "parking.": "trains keep their parking areas",
+}
 
 
 class Refused(NamedTuple):
@@ -48,29 +54,32 @@ OFF = frozenset(("", "0", "false", "False", "off", "no", "-1", "none", "0.0", "0
 OPTIONS = _words(
     "net-file route-files additional-files begin end scale scale-suffix max-depart-delay use-stop-ended",
     "default.departspeed",
+    "junction-taz",
     "railway.max-train-length weights.reversal-penalty weights.turnaround-penalty weights.minor-penalty weights.priority-factor",
 )
 
-#: That of which is said with the signals: see ``of_signals``.
-MOVING_BLOCK = "railsignal-moving-block"
+#: Those of which is said with the signals, see ``of_signals``: how they begin, and the one that is no difference to moving block.
+OF_SIGNALS, MOVING_BLOCK = ("railsignal", "tls."), "railsignal-moving-block"
 
 #: Options that cannot change the run of a train: what is written, drawn and checked, and how fast SUMO itself runs.
 OPTIONS_OF_NO_EFFECT = _words(
-    "verbose v print-options help version xml-validation xml-validation.net xml-validation.routes no-warnings W suppress-warnings",
-    "aggregate-warnings log l message-log error-log language no-step-log step-log.period duration-log.disable",
-    "duration-log.statistics t no-duration-log output-prefix output-suffix precision precision.geo human-readable-time threads",
-    "route-steps gui-settings-file g quit-on-end Q start S delay d game breakpoints remote-port num-clients demo registry-viewport",
-    "window-size window-pos tracker-interval gui-testing save-configuration C save-template save-schema save-commented",
-    "no-internal-links duration-log netstate-dump netstate netstate-dump.empty-edges summary tripinfo",
-    "save-state.times save-state.period save-state.files save-state.prefix save-state.suffix",
-    "ignore-accidents check-accidents pedestrian.model emissions.volumetric-fuel write-license error-log.append crs",
-    "load-state.offset load-state.remove-vehicles",
+    "verbose print-options help version xml-validation xml-validation.net xml-validation.routes no-warnings aggregate-warnings",
+    "message-log error-log language no-step-log step-log.period duration-log.disable duration-log.statistics output-prefix",
+    "output-suffix precision precision.geo human-readable-time threads route-steps quit-on-end start delay breakpoints remote-port",
+    "num-clients demo registry-viewport window-size window-pos tracker-interval save-template save-schema save-commented",
+    "netstate-dump netstate-dump.empty-edges netstate-dump.precision write-license write-metadata configuration-file",
+    "load-state.offset load-state.remove-vehicles edgedata-files alternative-net-file selection-file disable-textures",
+    "emergencydecel.warning-threshold waiting-time-memory max-num-persons",
 )
 
-#: How the names of other such options begin: of devices that watch trains, and of what is no train.
+#: Devices that watch a train, and do nothing to its run.
+WATCHING = _words("fcd emissions ssm tripinfo vehroute battery elechybrid btreceiver btsender example transportable")
+
+#: How the names of other such options begin: of such devices, and of what is no train.
 OF_NO_EFFECT_FROM = (
-    "gui", "emissions.", "pedestrian.", "person-device.", "persontrip.",
-    *(f"device.{name}." for name in ("fcd", "emissions", "ssm", "tripinfo", "vehroute")),
+    "gui", "log", "game", "save-configuration", "save-state.", "emissions.", "phemlight-", "pedestrian.", "person-device.",
+    "persontrip.", "intermodal-collision.", "ride.", "overhead-wire.",
+    *(f"device.{name}." for name in sorted(WATCHING)),
 )  # fmt: skip
 
 #: Options that are not followed: in which words, and the values with which they mean nothing.
@@ -79,9 +88,8 @@ OPTIONS_NAMED: Mapping[str, tuple[str, frozenset[str]]] = {
     "seed": ("what is drawn is drawn with a seed of its own", frozenset()),
     "random": ("what is drawn is drawn with a seed of its own", OFF),
     "default.departlane": ("trains begin on a lane that allows them and leads on", _words("best_prob best first 0 allowed free")),
-    "default.departpos": ("a train without departPos begins with its rear at the beginning of the edge", _words("base")),
     "default.speeddev": ("no speed is drawn", OFF),
-    "time-to-teleport": ("trains are never teleported", OFF | {"-1", "300"}),
+    "time-to-teleport": ("trains are never teleported", OFF),
     "time-to-teleport.highways": ("trains are never teleported", OFF),
     "time-to-teleport.bidi": ("trains are never teleported", OFF),
     "time-to-teleport.railsignal-deadlock": ("trains are never teleported", OFF),
@@ -100,6 +108,14 @@ OPTIONS_NAMED: Mapping[str, tuple[str, frozenset[str]]] = {
     "eager-insert": ("a train enters when it can do so safely", OFF),
     "random-depart-offset": ("trains depart when they are to", OFF),
     "load-state": ("trains begin as their routes say", OFF),
+    "no-internal-links": ("trains run over the edges that junctions have inside", OFF),
+    "ignore-accidents": ("trains that collide are always found", OFF),
+    "keep-after-arrival": ("a train that has arrived is gone", OFF),
+    "weight-files": (KEEP_ROUTES, OFF),
+    "lateral-resolution": ("trains keep to the middle of their tracks", OFF | {"-1"}),
+    "sloppy-insert": ("a train enters when it can do so safely", OFF),
+    "emergency-insert": ("a train enters when it can do so safely", OFF),
+    "extrapolate-departpos": ("a train begins where departPos says", OFF),
 }  # fmt: skip
 
 #: Elements of route and additional files, with the attributes of them that are followed.
@@ -222,7 +238,9 @@ ELEMENTS_OF_NO_EFFECT = _words(
 )
 
 #: Elements of a net.
-NET_ELEMENTS = _words("location type edge junction connection prohibition roundabout param")
+NET_ELEMENTS = _words("location type edge junction connection prohibition roundabout param neigh")
+#: Those that are not followed, in which words.
+NET_NAMED = {"stopOffset": "trains stop where the track ends or a signal stands"}
 #: Attributes of edges, lanes and connections that matter, and those that only draw.
 NET_EDGE = _words("id from to priority type function bidi distance spreadType shape name length crossingEdges routingType")
 NET_LANE = _words(
@@ -235,14 +253,26 @@ NET_CONNECTION = _words(
 
 
 #: The same of options whose names begin so.
-OPTIONS_NAMED_FROM = {"device.rerouting.": (KEEP_ROUTES, OFF)}
+OPTIONS_NAMED_FROM = {
+    "device.rerouting.": (KEEP_ROUTES, OFF),
+    "device.": (NO_DEVICE, OFF),
+    "meso-": ("trains are simulated one by one", frozenset[str]()),
+    "lanechange.": ("trains keep to their tracks", OFF),
+    "time-to-teleport.": ("trains are never teleported", OFF),
+    "collision.": ("trains that collide stay where they are, and the run fails", OFF),
+}
+
+#: Options with which a configuration is not run.
+OPTIONS_REFUSED = {"mesosim": Refused("SUMO's mesoscopic model has no trains on tracks; take it out")}
 
 
 def of_options(options: Mapping[str, str]) -> Said:
     """What options of a configuration are followed, one line for all, and which are not, one line each."""
-    followed, lines = [], []
+    followed, lines, refused = [], [], []
     for key, value in options.items():
-        if key == MOVING_BLOCK or key in OPTIONS_OF_NO_EFFECT or "output" in key or key.startswith(OF_NO_EFFECT_FROM):
+        if key in OPTIONS_REFUSED and value not in OFF:
+            refused.append(f"option {key} = {value}: {OPTIONS_REFUSED[key].why}")
+        if key in OPTIONS_REFUSED or key.startswith(OF_SIGNALS) or _no_effect(key):
             continue
         kind = next((said for start, said in OPTIONS_NAMED_FROM.items() if key.startswith(start)), (UNKNOWN, frozenset[str]()))
         words, idle = OPTIONS_NAMED.get(key, kind)
@@ -250,7 +280,17 @@ def of_options(options: Mapping[str, str]) -> Said:
             followed.append(key)
         else:
             lines.append(f"option {key} = {value}: not followed: {words}")
-    return Said([f"options: {', '.join(followed)}"] if followed else [], lines, [])
+    return Said([f"options: {', '.join(followed)}"] if followed else [], lines, refused)
+
+
+def strange(options: Iterable[str]) -> list[str]:
+    """Options that the tables do not have, of SUMO's or none."""
+    tables: tuple[Collection[str], ...] = (OPTIONS, OPTIONS_NAMED, OPTIONS_REFUSED)
+    return [key for key in options if not any(key in table for table in tables) and key not in OPTIONS_OF_NO_EFFECT]
+
+
+def _no_effect(key: str) -> bool:
+    return key in OPTIONS_OF_NO_EFFECT or "output" in key or key.startswith(OF_NO_EFFECT_FROM)
 
 
 def of_trains(elements: Iterable[Element]) -> Said:
@@ -281,8 +321,8 @@ def _of_one(element: Element) -> Iterator[tuple[str, str, str | Refused | None]]
     tag = element.tag
     if tag == "param":  # what SUMO does not know is the user's own
         key = element.get("key", "")
-        if key.startswith(REROUTING_PARAMS) and element.get("value", "") not in OFF:
-            yield tag, key, KEEP_ROUTES
+        if (why := _of_param(key)) and element.get("value", "") not in OFF:
+            yield tag, key, why
         return
     if tag.startswith("carFollowing-"):
         yield tag, "", DRIVEN
@@ -291,7 +331,13 @@ def _of_one(element: Element) -> Iterator[tuple[str, str, str | Refused | None]]
         yield tag, "", UNKNOWN
         return
     for key, value in element.items():
-        if key == "id" or key in OF_NO_EFFECT.get(tag, ()) or (tag == "vType" and key.startswith(("lc", "jm"))):
+        if key == "id" or key in OF_NO_EFFECT.get(tag, ()) or (tag == "vType" and key.startswith("lc")):
+            continue
+        if tag == "vType" and key.startswith("jm"):
+            yield tag, key, DRIVEN
+            continue
+        if tag == "stop" and key == "until" and not bad_number(speed := element.get("speed")) and float(speed or "0") > 0.0:
+            yield tag, f"{key} with speed", "a train passes a waypoint whenever it comes"
             continue
         said = NAMED.get((tag, key), (UNKNOWN, frozenset[str]()))
         if key in ELEMENTS[tag]:
@@ -300,6 +346,15 @@ def _of_one(element: Element) -> Iterator[tuple[str, str, str | Refused | None]]
             yield tag, key, said
         else:
             yield tag, key, None if value in said[1] else said[0]
+
+
+def _of_param(key: str) -> str:
+    """Why a param that SUMO itself reads is not followed; "": it reads none of this name, or it changes no run."""
+    start, _, rest = key.partition(".")
+    if start in ("has", "device"):
+        device = rest.partition(".")[0]
+        return "" if device in WATCHING else KEEP_ROUTES if device in ("rerouting", "routing") else NO_DEVICE
+    return next((why for begin, why in PARAMS_NAMED.items() if key.startswith(begin)), "")
 
 
 def of_others(elements: Iterable[Element], unread: Iterable[Element]) -> Said:
@@ -323,7 +378,7 @@ def of_others(elements: Iterable[Element], unread: Iterable[Element]) -> Said:
 def of_net(net: NetFile) -> list[str]:
     """What a net says that is not followed, one line for each."""
     counts = Counter(_unknown(net))
-    lines = [f"net: {n} x {what}: not followed: {UNKNOWN}" for what, n in counts.items()]
+    lines = [f"net: {n} x {what}: not followed: {NET_NAMED.get(what.strip('<>'), UNKNOWN)}" for what, n in counts.items()]
     lights = sum(j.attributes.get("type", "").startswith("traffic_light") for j in net.junctions)
     if lights:
         lines.append(f"net: {lights} x traffic lights: not obeyed")
@@ -334,15 +389,17 @@ def of_signals(signals: int, options: Mapping[str, str], elements: Iterable[Elem
     """What is said of rail signals and all that belongs to them, one line for each: followed where they are obeyed, else named."""
     counts = Counter(e.tag for e in elements if e.tag in ELEMENTS_OF_SIGNALS)
     value = options.get(MOVING_BLOCK, "")
+    belonging = [key for key in options if key.startswith(OF_SIGNALS) and not _no_effect(key)]
     if obeyed:
         lines = [f"net: {signals} x rail signals"] if signals else []
-        lines += [f"options: {MOVING_BLOCK}"] if value else []
+        lines += [f"options: {', '.join(belonging)}"] if belonging else []
         return Said([*lines, *(f"<{tag}>: {n}" for tag, n in counts.items())], [], [])
     lines = (
         [f"net: {signals} x rail signals: not obeyed: our own interlocking keeps trains apart in moving block"] if signals else []
     )
     if value not in OFF:
         lines.append(f"option {MOVING_BLOCK} = {value}: not followed: trains are kept apart in moving block anyway")
+    lines += [f"option {key} = {options[key]}: not followed: signals are not obeyed" for key in belonging if key != MOVING_BLOCK]
     return Said([], [*lines, *(f"{n} x <{tag}>: not followed: {ELEMENTS_OF_SIGNALS[tag]}" for tag, n in counts.items())], [])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
@@ -86,6 +87,19 @@ def unmarked(edges: Iterable[str], tracks: Tracks) -> list[str]:
     return [e for e in dict.fromkeys(edges) if not any(for_trains(lane) for lane in lanes.get(e, []))]
 
 
+def restricted(routes: Iterable[tuple[str, tuple[str, ...]]], tracks: Tracks) -> list[str]:
+    """Mistakes: edges of routes, each with the class of its train, whose type has a speed limit of its own for that class."""
+    limits, found = tracks.file.restrictions, dict[str, None]()
+    types = {e.attributes.get("id", ""): e.attributes.get("type", "") for e in tracks.file.edges} if limits else {}
+    for vclass, edges in set(routes) if limits else ():
+        for edge in edges:
+            speed = limits.get(types[edge], {}).get(vclass)
+            if speed is not None and not (is_number(speed) and float(speed) == tracks.speed.get(edge)):
+                line = f"edge {edge}: its type {types[edge]} has a restriction of {vclass} to {speed} m/s: limits of one class are"
+                found[f"{line} not followed; give that speed to the lanes of the edge"] = None
+    return list(found)
+
+
 def place_of(stop: Element, elements: Elements, tracks: Tracks) -> Place:
     """Where a stop is: at a place with a name, or on a lane or an edge."""
     for tag in PLACES:
@@ -118,11 +132,15 @@ def place_of(stop: Element, elements: Elements, tracks: Tracks) -> Place:
     if said_wrong:
         return Place(lane, 0.0, f"{said}: {', '.join(said_wrong)}: must be a number, a time not negative")
     position += length if position < 0 else 0.0
-    if where.get("friendlyPos", "0").lower() in YES:
+    if friendly := where.get("friendlyPos", "0").lower() in YES:
         position = min(max(position, 0.0), length)
     # SUMO itself lets a stop be a bit beyond the end.
     if not 0.0 <= position <= length + 0.1:
         return Place(lane, 0.0, f"{said}: endPos = {where.get('endPos')}: off the edge, which is {length:g} m long")
+    begin = where.get("startPos", "0")
+    start = float(begin) if is_number(begin) else math.nan
+    if not friendly and not (start + (length if start < 0 else 0.0) <= position):
+        return Place(lane, 0.0, f"{said}: startPos = {begin}: must be a number, and not behind its end at {position:g} m")
     wrong = ""
     ends = seconds(stop.get("duration", "-1")) >= 0 or stop.get("until") is not None
     triggered = any(stop.get(key, "false").lower() in YES for key in ("triggered", "containerTriggered"))

@@ -25,6 +25,7 @@ from trainctl.traffic.files import (
     PLACES,
     Elements,
     bad_number,
+    by_name,
     is_number,
     is_time,
     named_files,
@@ -35,11 +36,24 @@ from trainctl.traffic.files import (
 )
 from trainctl.traffic.handed import Source
 from trainctl.traffic.kinds import Kind, default_types, kind_of
-from trainctl.traffic.places import YES, Area, Place, Tracks, area_of, off_route, place_of, read_tracks, unconnected, unmarked
+from trainctl.traffic.known import strange
+from trainctl.traffic.places import (
+    YES,
+    Area,
+    Place,
+    Tracks,
+    area_of,
+    off_route,
+    place_of,
+    read_tracks,
+    restricted,
+    unconnected,
+    unmarked,
+)
 from trainctl.traffic.rail_signals import Signal, rail_signals
 from trainctl.traffic.scale import scaled
 from trainctl.traffic.speed_signs import Change, speed_signs
-from trainctl.traffic.trial import in_doubt, tried
+from trainctl.traffic.trial import in_doubt, options_of_sumo, tried
 
 #: What SUMO takes in place of a number; the first is its default.
 _WORDS = {
@@ -50,6 +64,9 @@ _WORDS = {
 
 #: What may be drawn of a train, each by its number here.
 _DRAWN = ("departEdge", "arrivalEdge", "departPos", "departSpeed", "arrivalPos")
+
+#: How long a flow lasts of which nothing is said [s].
+DAY_S = 86400.0
 
 #: How fast a train begins of which nothing is said: SUMO's own default since 1.27.
 DEPART_SPEED = "avg"
@@ -127,7 +144,9 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
     """
     options = read_options(sumocfg)
     net, routes, more = (named_files(sumocfg, options, key) for key in ("net-file", "route-files", "additional-files"))
-    wrong = [f"{sumocfg}: no net-file"] if not net else []
+    others = strange(options)
+    wrong = [f"{sumocfg}: option {key}: SUMO has none of this name" for key in others if key not in options_of_sumo()]
+    wrong += [f"{sumocfg}: no net-file"] if not net else []
     wrong += [f"{sumocfg}: no route-files, nor additional-files with trains in them"] if not routes and not more else []
     wrong += [f"{sumocfg}: {path}: no such file" for path in (*net, *routes, *more) if not path.is_file()]
     times = {}
@@ -136,6 +155,8 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         times[key] = seconds(said) if is_time(said) else math.nan
         if not (times[key] > 0 if key == "step-length" else math.isfinite(times[key])):
             wrong.append(f"{sumocfg}: {key} = {said}: must be a time{', above 0' if key == 'step-length' else ''}")
+    if times["end"] not in (-1.0, math.nan) and times["end"] <= times["begin"]:
+        wrong.append(f"{sumocfg}: end = {options['end']}: must be after begin = {times['begin']:g} s")
     patience, scale = options.get("max-depart-delay", "-1"), options.get("scale", "1")
     if not is_time(patience):
         wrong.append(f"{sumocfg}: max-depart-delay = {patience}: must be a time")
@@ -158,6 +179,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
     elements = read_demand(more, routes)
     if options.get("use-stop-ended", "false").lower() in YES:
         _ended(elements)
+    _bounded(elements, begin, own_end)
     wrong = [
         f"vType {name}: {key} = {element.get(key)}: must be a number, not negative"
         for name, element in elements.types.items()
@@ -205,6 +227,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
         departures.append((order[source.get("id", "")], train))
         handed[name] = vehicle, source, train.edges
         wrong += mistakes
+    wrong += [f"{net[0]}: {line}" for line in restricted(((kinds[d.kind].vclass, d.edges) for _, d in departures), tracks)]
     if wrong:
         raise InputError(list(dict.fromkeys(wrong)))
     if not departures:
@@ -217,6 +240,7 @@ def read_traffic(sumocfg: Path, work: Path, duration_s: float | None = None, see
             f"net: {len(plain)} x edges of routes are open to all classes, to no rail class by name: taken for tracks without"
             " road traffic"
         )
+    notes += _too_fast([d for _, d in departures], kinds, tracks)
     notes += crossings.told(tracks.file, [d.edges for _, d in departures])
     return Configuration(
         net=net[0],
@@ -249,6 +273,14 @@ def _comes(train: Element, begin: float, end: float) -> bool:
         return begin <= _departs(train, begin) < end
     sure = train.get("number", "1") != "0" and "probability" not in train.attrib
     return sure and begin <= seconds(train.get("begin", "0")) < min(end, seconds(train.get("end", "inf")))
+
+
+def _bounded(elements: Elements, begin: float, end: float | None) -> None:
+    """Give flows that spread a number of trains over no stated time the end that they have in SUMO."""
+    stated = {"end", "period", "vehsPerHour", "perHour", "probability"}
+    for flow in (t for t in elements.trains if t.tag == "flow" and "number" in t.attrib and stated.isdisjoint(t.attrib)):
+        if is_time(said := flow.get("begin", repr(begin))):
+            flow.set("end", repr(end if end is not None else seconds(said) + DAY_S))
 
 
 def _ended(elements: Elements) -> None:
@@ -305,12 +337,18 @@ def _departure(
     firsts = [max(k // of_lap * len(edges) - first, 0) if k < laps * of_lap else 0 for k, _ in enumerate(vehicle.iter("stop"))]
     edges = (edges * laps)[first:end]
     given = list(vehicle.iter("stop"))
+    dropped = laps * of_lap + len([e for e in source if e.tag == "stop"]) - len(given)
     places = [place_of(stop, elements, tracks) for stop in given]
     # duarouter counts ``until`` at stops of a named route from the departure, as SUMO does, but not ``arrival``.
-    late = float(vehicle.get("depart", "0")) if source.get("route") else 0.0
+    late = float(vehicle.get("depart", "0")) if by_name(source) else 0.0
     planned = [_planned(stop, late if k < of_lap else 0.0 if k >= laps * of_lap else None) for k, stop in enumerate(given)]
     wrong = [f"train {name}: {m}" for m in (*unconnected(list(edges), tracks), *off_route(edges, places, firsts))]
     wrong += [f"train {name}: {cut}"] if isinstance(cut, str) else []
+    wrong += (
+        [f"train {name}: SUMO's duarouter drops {dropped} of its stops; let them end more than 0.1 m in on their edges"]
+        if dropped > 0
+        else []
+    )
     # Where a stop is said to have ended, later than planned, what is planned of the next ones may lie before.
     were_late = any(stop.get("ended") for one in (source, *routes_of(source, elements)) for stop in one.iter("stop"))
     wrong += [f"train {name}: {m}" for m in (_backwards(given, planned, places) if laps == 1 and not were_late else [])]
@@ -371,6 +409,20 @@ def _departure(
         speed_mps = 0.0
     like = speed if speed in ("avg", "last") else ""
     return departure._replace(position_m=position, arrival_m=arrival_m, speed_mps=speed_mps, like=like), wrong
+
+
+def _too_fast(departures: list[Departure], kinds: dict[str, Kind], tracks: Tracks) -> list[str]:
+    """What is said of trains that are to begin faster than their type or their edge allows."""
+    found = []
+    for d in departures:
+        kind = kinds[d.kind]
+        drawn = "(" in kind.attributes.get("speedFactor", "") or "speedDev" in kind.attributes
+        limit = min(kind.max_speed_mps, math.inf if drawn else kind.speed_factor * tracks.speed[d.edges[0]])
+        if d.speed_mps is not None and d.speed_mps > limit + 0.01:  # SUMO's own tolerance
+            found.append(f"{d.id} ({d.speed_mps:g} m/s, allowed {limit:g})")
+    some = f"{', '.join(found[:8])}{' ...' if len(found) > 8 else ''}"
+    why = "they begin no faster than their vType and their edge allow, where SUMO ends with an error"
+    return [f"{len(found)} x departSpeed: not followed: {why}: {some}"] if found else []
 
 
 def _called(stop: Element, elements: Elements) -> str:

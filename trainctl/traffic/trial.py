@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import subprocess
+import tempfile
+from functools import cache
 from pathlib import Path
 
 from sumo_net.build import program
 from sumo_net.netfile import NetFile, content
 from trainctl.errors import InputError
+from trainctl.traffic.files import parse
 from trainctl.traffic.known import NET_CONNECTION, NET_EDGE, NET_LANE
 
 #: Seconds after which SUMO is taken for stuck.
@@ -40,6 +43,17 @@ def tried(net: Path) -> None:
 def tried_as_a_whole(configuration: Path, begin_s: float, called: str) -> None:
     """The same of a configuration with all its trains, which is ``called`` so where SUMO refuses it."""
     _loaded(called, "-c", str(configuration), "--end", f"{begin_s:.3f}", "--route-steps", "0")
+
+
+@cache
+def options_of_sumo() -> frozenset[str]:
+    """Every option that the ``sumo`` program has."""
+    sumo, environment = program("sumo")
+    with tempfile.TemporaryDirectory(prefix="options.") as folder:
+        template = Path(folder) / "all.sumocfg"
+        command = [str(sumo), "--save-template", str(template)]
+        subprocess.run(command, env=environment, capture_output=True, check=False, timeout=PATIENCE_S)
+        return frozenset(e.tag for e in parse(template).iter() if "value" in e.attrib)
 
 
 def _loaded(called: str, *options: str) -> None:

@@ -349,7 +349,7 @@ def test_what_nobody_thought_of_is_named(files: Files) -> None:
     )
     said = files.sumocfg.read_text().replace(
         "<time>",
-        '<strange value="7"/><device.rerouting.period value="10"/><device.fcd.period value="3"/><fcd-output value="f.xml"/><verbose value="true"/><time>',
+        '<slope-centered value="true"/><device.rerouting.period value="10"/><device.fcd.period value="3"/><fcd-output value="f.xml"/><verbose value="true"/><time>',
     )
     files.sumocfg.write_text(said)
     net = files.folder / "n.net.xml"
@@ -357,7 +357,7 @@ def test_what_nobody_thought_of_is_named(files: Files) -> None:
     notes = read_traffic(files.sumocfg, files.folder / "work").notes
     unknown = "not followed: it is not known here"
     assert [n for n in notes if "not known" in n] == [
-        f"option strange = 7: {unknown}",
+        f"option slope-centered = true: {unknown}",
         f"1 x <vehicle flavour>, 1 x <stop mood>, 1 x <mystery>: {unknown}",
         f"2 x <riddle>: {unknown}",
         f"net: 1 x <edge colour>: {unknown}",
