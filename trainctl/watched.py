@@ -129,7 +129,9 @@ class Watched(Steps):
             if was and was != now_at:
                 self.journal.event(t, "stop_left", train=ids[i], stop=was)
             if now_at and was != now_at:
-                self.journal.event(t, "stop_reached", train=ids[i], stop=now_at)
+                self.journal.event(
+                    t, "stop_reached", train=ids[i], stop=now_at, **({"parked": True} if self.world.parked[i] else {})
+                )
         s = self._calls(t, seen, s)
         return s._replace(entered=s.entered | seen.present, edge=edge, stops=self.world.stops)
 
@@ -164,7 +166,8 @@ class Watched(Steps):
             links=_nobody(n), motion=motion, saturated=np.zeros(n, bool),
             extremes=Extremes.fresh(n, 0, 0)._replace(energy=s.energy), disturbed=None, led=seen.present, spacing=now.spacing,
         )  # fmt: skip
-        self.record.tell(row, ways, seen, due, s.watch)
+        here = seen._replace(present=seen.present & ~self.world.parked)  # who is parked is in nobody's way
+        self.record.tell(row, ways, here, due, s.watch)
 
 
 def _nobody(trains: int) -> Links:

@@ -101,6 +101,10 @@ class SelfDriven(Protocol):
         """What the stop is called at which each train stands now, "" if at none, n of them."""
 
     @property
+    def parked(self) -> Bools:
+        """Which trains are off their tracks at that stop, shape (n,)."""
+
+    @property
     def over(self) -> bool:
         """Whether every train has left, and none is still to come."""
 

@@ -47,8 +47,8 @@ def folder(tmp_path):
     return tmp_path
 
 
-def baseline(folder, body: str, more: str, options: str, **controller: Any) -> Run:
-    nets.traffic(folder, body, RAIL)
+def baseline(folder, body: str, more: str, options: str, end: int = 9000, **controller: Any) -> Run:
+    nets.traffic(folder, body, RAIL, end=end)
     (folder / "s.add.xml").write_text(f"<additional>{more}</additional>")
     cfg = folder / "a.sumocfg"
     text = cfg.read_text()
@@ -73,6 +73,7 @@ def test_every_train_arrives_when_it_does_in_plain_sumo(folder, case):
     assert all(ours[name] == pytest.approx(theirs[name], abs=1.0) for name in ours)
     stops = [e for e in found.events if e["kind"] == "stop_left"]
     assert len(stops) == len([row for row in plain(folder, "stop") if row.get("state") != "waypoint"])
+    assert not [e for e in found.events if e["kind"] == "violation" and e["bound"] == "gap_m"]
     assert [e["what"] for e in found.events if e["kind"] == "not_followed"] == [
         "options time-to-teleport and collision.action: trains are never teleported, none is removed that collides"
     ]
@@ -83,6 +84,13 @@ def test_every_train_arrives_when_it_does_in_plain_sumo(folder, case):
     if case != "waypoint":  # SUMO tells when the train was at its slowest there
         for (name, *ours), (other, *times) in zip(sorted(made), sorted(theirs), strict=True):
             assert name == other and ours == pytest.approx(times, abs=1.0)
+
+
+def test_a_number_of_trains_is_spread_until_the_end_of_the_configuration(folder):
+    body = '<flow id="f" type="emu" begin="0" number="3"><route edges="ab bc"/></flow>'
+    found = baseline(folder, body, "", "", end=900)
+    ours = [e["time_s"] for e in found.events if e["kind"] == "depart"]
+    assert ours == [float(row["depart"]) for row in plain(folder, "tripinfo")] == [0.0, 300.0, 600.0]
 
 
 def test_what_moving_block_changes_is_named(folder):

@@ -25,8 +25,8 @@ NEARER = 7.0
 class Listed:
     """A simulator whose trains are where a list says: position and speed of every train at every instant, NaN: not there."""
 
-    def __init__(self, p, instants, planned=(0.0, 0.0), standing=()):
-        self.standing = dict(standing)
+    def __init__(self, p, instants, planned=(0.0, 0.0), standing=(), parked=(False, False)):
+        self.standing, self.parked = dict(standing), np.array(parked)
         self.line, self.instants, self.k, self.planned, self.routed = p.line, np.array(instants, float), 0, np.array(planned), []
         routes = [[p.line.index[e] for e in route] for route in p.roster.routes]
         self.ways = ways(routes, p.line.start_m, p.line.length_m)
@@ -192,3 +192,14 @@ def test_a_reroute_is_ordered_where_its_switch_is_not_locked(prepared, tmp_path)
     told = [(e["time_s"], e["kind"], e["train"]) for e in events if e["kind"].startswith("reroute")]
     assert told == [(1.0, "reroute", "2"), (2.0, "reroute_refused", "1")]
     assert [(k, train) for k, train, _ in world.routed] == [(1, 1)]
+
+
+@pytest.mark.parametrize("parked", [False, True])
+def test_who_is_parked_is_in_nobodys_way(prepared, tmp_path, parked):
+    """The rear of the train ahead at 2900 m, the one behind passes it."""
+    p = prepared()
+    instants = [[(3000.0, 0.0), (2860.0 + 30.0 * k, 30.0)] for k in range(5)]
+    world = Listed(p, instants, standing=dict.fromkeys(range(1, 5), ("yard", "")), parked=(parked, False))
+    _, _, events = watched(p, world, tmp_path)
+    assert bool([e for e in events if e["kind"] == "violation" and e["bound"] == "gap_m"]) is not parked
+    assert [e.get("parked", False) for e in events if e["kind"] == "stop_reached"] == [parked]

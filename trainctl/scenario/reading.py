@@ -10,6 +10,7 @@ import difflib
 import importlib.resources
 import json
 import math
+import shlex
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -40,7 +41,7 @@ def find(name: str) -> Path:
         if not path.is_file():
             raise InputError(f"{name}: no such scenario file")
         if path.suffix in (".sumocfg", ".cfg"):
-            cure = f"`trainctl new scenario {name}` writes one for its trains"
+            cure = f"`trainctl new scenario {shlex.quote(name)}` writes one for its trains"
             raise InputError(f"{name}: a SUMO configuration is no scenario: {cure}")
         return path
     known = shipped()

@@ -59,7 +59,7 @@ class Baseline(Session):
         position = self.ways.begin[row] + (
             np.array([d.position_m for d in self.departures]) if p.placed else p.roster.lane_position
         )
-        self.stops = ("",) * len(self.ids)
+        self.stops, self.parked = ("",) * len(self.ids), np.zeros(len(self.ids), bool)
         self.others: dict[str, str] = {}  # vClass of who runs beside the trains that are known
         self.seen = Seen(position, self.ways.edge[row], row, there)  # where they will come
 
@@ -115,21 +115,22 @@ class Baseline(Session):
         }
         position, row, present = self.seen.position.copy(), self.seen.row.copy(), np.zeros(n, bool)
         self.speed: Floats = np.full(n, np.nan)
-        stops = [""] * n
+        stops, parked = [""] * n, np.zeros(n, bool)
         for name in there:
             i = self.number[name]
             row[i], present[i] = row_of(self, rails, i, vehicle.getRoadID(name)), True
             position[i] = self.ways.begin[row[i]] + vehicle.getLanePosition(name)
             self.speed[i] = vehicle.getSpeed(name)
             stops[i] = _stop(name) if vehicle.isStopped(name) else ""
-        self.stops = tuple(stops)
+            parked[i] = bool(stops[i]) and vehicle.isStoppedParking(name)
+        self.stops, self.parked = tuple(stops), parked
         self.seen = Seen(position, self.ways.edge[row], row, present)
         self.ahead: Ints = np.full(n, -1)
         self.spacing: Floats = np.full(n, np.nan)
         if self.p.placed:
             self._ahead_on_track()
         else:
-            for name in there:
+            for name in (name for name in there if not parked[self.number[name]]):
                 self._ahead_on_way(name)
 
     def _ahead_on_track(self) -> None:

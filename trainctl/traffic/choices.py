@@ -46,6 +46,9 @@ def choices(elements: list[Element], routes: Mapping[str, Element], tracks: Trac
                     if tag == "routeProbReroute" and edges:
                         wrong += [] if name in routes else [f"{who}: {tag} {name}: no such route"]
                         edges = tuple(routes[name].get("edges", "").split()) if name in routes else ()
+                    if name == "terminateRoute":
+                        wrong.append(f"{who}: {tag} {name}: no train ends at a rerouter; end its route there, or take this out")
+                        continue
                     wrong += [f"{who}: {tag} {name}: {line}" for line in unconnected(list(edges), tracks)]
                     wrong += (
                         [f"{who}: {tag} {name}: probability = {weight}: must be a number, not negative"]

@@ -7,16 +7,8 @@ from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 from trainctl.traffic.files import bad_number, is_time, parse, seconds
+from trainctl.traffic.known import REROUTERS_NAMED
 from trainctl.traffic.places import YES, Tracks
-
-#: What else a rerouter may hold: why it is not followed.
-OTHERS = {
-    "closingLaneReroute": "no lane is closed",
-    "parkingAreaReroute": "trains keep their parking areas",
-    "stationReroute": "trains keep their stops",
-    "viaProbReroute": "trains keep their routes",
-    "overtakingReroute": "trains keep their routes; our own interlocking lets them meet",
-}
 
 
 class Closing(NamedTuple):
@@ -49,7 +41,8 @@ def closings(elements: list[Element], tracks: Tracks, classes: set[str]) -> tupl
             times = [interval.get("begin", "0"), interval.get("end", "1e9")]
             mistakes += [f"{who}: interval {text}: must be a time" for text in times if not is_time(text)]
             for child in interval:
-                notes += [f"{who}: <{child.tag}>: not followed: {OTHERS[child.tag]}"] if child.tag in OTHERS else []
+                why = REROUTERS_NAMED.get(child.tag)
+                notes += [f"{who}: <{child.tag}>: not followed: {why}"] if why else []
                 if child.tag != "closingReroute":
                     continue
                 edge = child.get("id", "")

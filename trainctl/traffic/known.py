@@ -230,6 +230,33 @@ ELEMENTS_OF_SIGNALS: Mapping[str, str] = {
 #: Whole elements of additional files that are followed.
 ELEMENTS_FOLLOWED = _words("variableSpeedSign rerouter")
 
+#: What of them, and of the elements in them, is followed, told elsewhere, or drawn.
+OF_FOLLOWED: Mapping[str, frozenset[str]] = {
+    "variableSpeedSign": _words("id lanes file vTypes name pos"),  # SUMO shows it to every type
+    "step": _words("time speed"),
+    "rerouter": _words("id edges file probability off vTypes timeThreshold name pos"),
+    "interval": _words("id begin end"),
+    "closingReroute": _words("id allow disallow"),
+    "destProbReroute": _words("id probability"),
+    "routeProbReroute": _words("id probability"),
+}
+
+#: Attributes of these that are not followed, in which words.
+OF_FOLLOWED_NAMED = {
+    ("rerouter", "optional"): "trains are rerouted there unasked",
+    ("rerouter", "radius"): "trains are rerouted where they come onto its edges",
+    ("closingReroute", "until"): "a train goes round a closed edge, however long it is closed",
+}
+
+#: What a rerouter may hold besides: why it is not followed.
+REROUTERS_NAMED = {
+    "closingLaneReroute": "no lane is closed",
+    "parkingAreaReroute": "trains keep their parking areas",
+    "stationReroute": "trains keep their stops",
+    "viaProbReroute": "trains keep their routes",
+    "overtakingReroute": "trains keep their routes; our own interlocking lets them meet",
+}
+
 #: Elements that cannot change the run of a train: outputs, drawings, and what belongs to roads.
 ELEMENTS_OF_NO_EFFECT = _words(
     "poly poi location type include param inductionLoop e1Detector instantInductionLoop laneAreaDetector e2Detector",
@@ -370,9 +397,21 @@ def of_others(elements: Iterable[Element], unread: Iterable[Element]) -> Said:
             followed.append(f"<{tag}>: {n}")
         else:
             lines.append(f"{n} x <{tag}>: not followed: {ELEMENTS_NAMED.get(tag, UNKNOWN)}")
+    inner = Counter(found for e in elements if e.tag in ELEMENTS_FOLLOWED for found in _within(e))
+    for (tag, key), n in inner.items():
+        lines.append(f"{n} x <{f'{tag} {key}'.rstrip()}>: not followed: {OF_FOLLOWED_NAMED.get((tag, key), UNKNOWN)}")
     for tag, n in Counter(e.tag for e in unread).items():
         lines.append(f"{n} x <{tag}> in route files: not followed, as in SUMO, which reads it in additional files alone")
     return Said(followed, lines, [])
+
+
+def _within(element: Element) -> Iterator[tuple[str, str]]:
+    """Element and attribute of what stands in a sign or a rerouter and is not followed; no attribute: the element as a whole."""
+    for one in element.iter():
+        if one.tag in OF_FOLLOWED:
+            yield from ((one.tag, key) for key, value in one.items() if key not in OF_FOLLOWED[one.tag] and value not in OFF)
+        elif one.tag not in ELEMENTS_OF_NO_EFFECT and one.tag not in REROUTERS_NAMED:
+            yield one.tag, ""
 
 
 def of_net(net: NetFile) -> list[str]:

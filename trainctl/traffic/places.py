@@ -124,10 +124,11 @@ def place_of(stop: Element, elements: Elements, tracks: Tracks) -> Place:
     arrival = stop.get("arrival", "0")
     said_wrong += [] if is_time(arrival) else [f"arrival = {arrival}"]
     said_wrong += [f"speed = {stop.get('speed')}"] if bad_number(stop.get("speed")) else []
+    end = stop.get("endPos", where.get("endPos"))  # a train may stop short of the end of a place
     try:
-        position = float(where.get("endPos", length))
+        position = float(length if end is None else end)
     except ValueError:
-        said_wrong.append(f"endPos = {where.get('endPos')}")
+        said_wrong.append(f"endPos = {end}")
         position = 0.0
     if said_wrong:
         return Place(lane, 0.0, f"{said}: {', '.join(said_wrong)}: must be a number, a time not negative")
@@ -136,7 +137,7 @@ def place_of(stop: Element, elements: Elements, tracks: Tracks) -> Place:
         position = min(max(position, 0.0), length)
     # SUMO itself lets a stop be a bit beyond the end.
     if not 0.0 <= position <= length + 0.1:
-        return Place(lane, 0.0, f"{said}: endPos = {where.get('endPos')}: off the edge, which is {length:g} m long")
+        return Place(lane, 0.0, f"{said}: endPos = {end}: off the edge, which is {length:g} m long")
     begin = where.get("startPos", "0")
     start = float(begin) if is_number(begin) else math.nan
     if not friendly and not (start + (length if start < 0 else 0.0) <= position):

@@ -291,8 +291,8 @@ def _ended(elements: Elements) -> None:
             stop.set("until", ended)
 
 
-def _lap(edges: tuple[str, ...], routes: list[Element]) -> tuple[tuple[str, ...], int, int]:
-    """The edges of one lap, how many laps, and the stops of each, of a train that runs over ``edges``.
+def _lap(edges: tuple[str, ...], routes: list[Element]) -> tuple[tuple[str, ...], int, list[Element]]:
+    """The edges of one lap, how many laps, and the stops in each, of a train that runs over ``edges``.
 
     duarouter always repeats the stops of a route that is repeated, but not always its edges.
     """
@@ -300,8 +300,8 @@ def _lap(edges: tuple[str, ...], routes: list[Element]) -> tuple[tuple[str, ...]
         once, repeat = tuple(route.get("edges", "").split()), route.get("repeat", "0")
         laps = (int(repeat) if repeat.isdecimal() else 0) + 1
         if edges in (once, once * laps):
-            return once, laps, len(list(route.iter("stop")))
-    return edges, 1, 0
+            return once, laps, list(route.iter("stop"))
+    return edges, 1, []
 
 
 def _drawn(seed: int, train: str, key: str) -> float:
@@ -331,13 +331,17 @@ def _departure(
     """A train out of what duarouter wrote and what the file said, and the mistakes in it."""
     name, route = vehicle.get("id", ""), vehicle.find("route")
     edges = () if route is None else tuple(route.get("edges", "").split())
-    edges, laps, of_lap = _lap(edges, routes_of(source, elements))
+    edges, laps, each = _lap(edges, routes_of(source, elements))
+    of_lap, meant = len(each), [*each * laps, *(e for e in source if e.tag == "stop")]
     cut = _cut(source, edges, laps, seed, name)
     first, end = (0, len(edges) * laps) if isinstance(cut, str) else cut
     firsts = [max(k // of_lap * len(edges) - first, 0) if k < laps * of_lap else 0 for k, _ in enumerate(vehicle.iter("stop"))]
     edges = (edges * laps)[first:end]
     given = list(vehicle.iter("stop"))
-    dropped = laps * of_lap + len([e for e in source if e.tag == "stop"]) - len(given)
+    dropped = len(meant) - len(given)
+    for stop, own in zip(given, meant, strict=False) if dropped == 0 else ():
+        if "endPos" in own.attrib and not own.attrib.keys().isdisjoint(PLACES):  # there duarouter leaves it out
+            stop.set("endPos", own.get("endPos", ""))
     places = [place_of(stop, elements, tracks) for stop in given]
     # duarouter counts ``until`` at stops of a named route from the departure, as SUMO does, but not ``arrival``.
     late = float(vehicle.get("depart", "0")) if by_name(source) else 0.0

@@ -184,6 +184,14 @@ def test_a_stop_that_begins_behind_its_end_is_a_mistake(read, place, told) -> No
     assert caught.value.mistakes == [f"train v: stop on edge bc: {told}: must be a number, and not behind its end at 100 m"]
 
 
+def test_a_stop_short_of_the_end_of_its_place_is_made_there_as_in_sumo(read, tmp_path) -> None:
+    place = '<busStop id="s" lane="bc_0" startPos="500" endPos="700"/>'
+    (tmp_path / "p.add.xml").write_text(f"<additional>{place}</additional>")
+    body = nets.train("v", WAY, 0, '<stop busStop="s" endPos="600" duration="10"/><stop busStop="s" duration="10"/>')
+    stops = read(body, '<additional-files value="p.add.xml"/>').departures[0].stops
+    assert [s.position_m for s in stops] == [float(s["pos"]) for s in plain(tmp_path, "stop")] == [600.0, 700.0]
+
+
 def test_no_stop_is_lost_in_silence(read) -> None:
     with pytest.raises(InputError) as caught:
         read(nets.train("v", WAY, 0, '<stop lane="bc_0" endPos="0" duration="10"/>'))
@@ -239,6 +247,36 @@ def test_a_number_of_trains_without_an_end_comes_as_in_sumo(read, tmp_path, begi
     theirs = [float(row["depart"]) for row in plain(tmp_path, "tripinfo")]
     assert len(theirs) == 3
     assert [d.depart_s for d in traffic.departures] == pytest.approx(theirs, abs=1.0)
+
+
+# Signs and rerouters
+
+
+@pytest.mark.parametrize(
+    ("attributes", "child", "told"),
+    [
+        ('radius="90"', "", "1 x <rerouter radius>: not followed: trains are rerouted where they come onto its edges"),
+        ('optional="true"', "", "1 x <rerouter optional>: not followed: trains are rerouted there unasked"),
+        ('optional="false" pos="3"', "", None),
+        ("", '<closingReroute id="by" until="90"/>',
+         "1 x <closingReroute until>: not followed: a train goes round a closed edge, however long it is closed"),
+        ("", '<riddle id="by"/>', "1 x <riddle>: not followed: it is not known here"),
+    ],
+)  # fmt: skip
+def test_what_a_rerouter_says_that_is_not_followed_is_named(read, tmp_path, attributes, child, told) -> None:
+    rerouter = f'<rerouter id="r" edges="ab" {attributes}><interval begin="0" end="9">{child}</interval></rerouter>'
+    (tmp_path / "r.add.xml").write_text(f"<additional>{rerouter}</additional>")
+    traffic = read(options='<additional-files value="r.add.xml"/>')
+    assert "<rerouter>: 1" in traffic.followed and traffic.notes == ((told,) if told else ())
+
+
+def test_a_rerouter_that_ends_routes_is_refused(read, tmp_path) -> None:
+    end = '<interval begin="0" end="9"><destProbReroute id="terminateRoute"/></interval>'
+    (tmp_path / "r.add.xml").write_text(f'<additional><rerouter id="r" edges="ab">{end}</rerouter></additional>')
+    with pytest.raises(InputError) as caught:
+        read(options='<additional-files value="r.add.xml"/>')
+    told = "rerouter r: destProbReroute terminateRoute: no train ends at a rerouter; end its route there, or take this out"
+    assert caught.value.mistakes == [f"{tmp_path / 'a.sumocfg'}: {told}"]
 
 
 # Nets
