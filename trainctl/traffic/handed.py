@@ -15,7 +15,7 @@ from trainctl.traffic.files import Elements, routes_of
 _OURS = re.compile(
     r"output|log|^save-|^load-|gui|^start$|^quit-on-end$|^remote-port$|^num-clients$|^netstate|warnings$"
     r"|-files?$|^begin$|^end$|^step-|^scale|^time-to-teleport|^collision|^device\.|^default\.action-step|^precision|internal-links$"
-    r"|^max-num|insert|^random-depart|^extrapolate|^keep-after|^lateral-|^lanechange"
+    r"|^max-num|^sloppy-insert|^emergency-insert|^insertion-checks|^random-depart|^extrapolate|^keep-after|^lateral-|^lanechange"
 )
 
 #: Elements of additional files that signals go by, and those that trains of SUMO's own meet.

@@ -59,7 +59,8 @@ OPTIONS = _words(
 )
 
 #: Those of which is said with the signals, see ``of_signals``: how they begin, and the one that is no difference to moving block.
-OF_SIGNALS, MOVING_BLOCK = ("railsignal", "tls."), "railsignal-moving-block"
+#: Without eager-insert a train that a constraint keeps out keeps out all that are to begin on its edge.
+OF_SIGNALS, MOVING_BLOCK = ("railsignal", "tls.", "eager-insert"), "railsignal-moving-block"
 
 #: Options that cannot change the run of a train: what is written, drawn and checked, and how fast SUMO itself runs.
 OPTIONS_OF_NO_EFFECT = _words(
@@ -105,7 +106,6 @@ OPTIONS_NAMED: Mapping[str, tuple[str, frozenset[str]]] = {
     "ignore-route-errors": ("routes must be connected", OFF),
     "max-num-vehicles": ("all trains come", OFF),
     "insertion-checks": ("a train enters when it can do so safely", frozenset()),
-    "eager-insert": ("a train enters when it can do so safely", OFF),
     "random-depart-offset": ("trains depart when they are to", OFF),
     "load-state": ("trains begin as their routes say", OFF),
     "no-internal-links": ("trains run over the edges that junctions have inside", OFF),
@@ -438,7 +438,8 @@ def of_signals(signals: int, options: Mapping[str, str], elements: Iterable[Elem
     )
     if value not in OFF:
         lines.append(f"option {MOVING_BLOCK} = {value}: not followed: trains are kept apart in moving block anyway")
-    lines += [f"option {key} = {options[key]}: not followed: signals are not obeyed" for key in belonging if key != MOVING_BLOCK]
+    others = [key for key in belonging if key != MOVING_BLOCK and options[key] not in OFF]
+    lines += [f"option {key} = {options[key]}: not followed: signals are not obeyed" for key in others]
     return Said([], [*lines, *(f"{n} x <{tag}>: not followed: {ELEMENTS_OF_SIGNALS[tag]}" for tag, n in counts.items())], [])
 
 

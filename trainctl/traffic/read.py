@@ -332,10 +332,11 @@ def _departure(
     name, route = vehicle.get("id", ""), vehicle.find("route")
     edges = () if route is None else tuple(route.get("edges", "").split())
     edges, laps, each = _lap(edges, routes_of(source, elements))
-    of_lap, meant = len(each), [*each * laps, *(e for e in source if e.tag == "stop")]
+    rounds = laps if by_name(source) else 1  # stops of a route in a train are the train's own, made once
+    of_lap, meant = len(each), [*each * rounds, *(e for e in source if e.tag == "stop")]
     cut = _cut(source, edges, laps, seed, name)
     first, end = (0, len(edges) * laps) if isinstance(cut, str) else cut
-    firsts = [max(k // of_lap * len(edges) - first, 0) if k < laps * of_lap else 0 for k, _ in enumerate(vehicle.iter("stop"))]
+    firsts = [max(k // of_lap * len(edges) - first, 0) if k < rounds * of_lap else 0 for k, _ in enumerate(vehicle.iter("stop"))]
     edges = (edges * laps)[first:end]
     given = list(vehicle.iter("stop"))
     dropped = len(meant) - len(given)
@@ -345,7 +346,7 @@ def _departure(
     places = [place_of(stop, elements, tracks) for stop in given]
     # duarouter counts ``until`` at stops of a named route from the departure, as SUMO does, but not ``arrival``.
     late = float(vehicle.get("depart", "0")) if by_name(source) else 0.0
-    planned = [_planned(stop, late if k < of_lap else 0.0 if k >= laps * of_lap else None) for k, stop in enumerate(given)]
+    planned = [_planned(stop, late if k < of_lap else 0.0 if k >= rounds * of_lap else None) for k, stop in enumerate(given)]
     wrong = [f"train {name}: {m}" for m in (*unconnected(list(edges), tracks), *off_route(edges, places, firsts))]
     wrong += [f"train {name}: {cut}"] if isinstance(cut, str) else []
     wrong += (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -38,6 +39,8 @@ def speed_signs(elements: list[Element], tracks: Tracks) -> tuple[list[Change], 
                 for key, what, good in (("time", "time", is_time), ("speed", "number", is_number))
                 if not good(step.get(key, "-1" if key == "speed" else ""))
             ]
+        if not mistakes and any(a > b for a, b in pairwise(seconds(step.get("time", "0")) for step in steps)):
+            mistakes.append(f"{who}: steps must be sorted by time")
         wrong += mistakes
         if mistakes:
             continue

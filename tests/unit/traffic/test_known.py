@@ -97,7 +97,7 @@ def test_options_that_change_a_run_in_sumo_are_named(read, key) -> None:
 
 def test_sumo_is_handed_no_option_that_is_said_not_to_be_followed(read) -> None:
     traffic = read(options='<max-num-vehicles value="1"/><eager-insert value="1"/><railsignal.max-block-length value="9"/>')
-    assert dict(handed(traffic.source, ["v"], [], 0.0).options).keys() == {"railsignal.max-block-length"}
+    assert dict(handed(traffic.source, ["v"], [], 0.0).options).keys() == {"eager-insert", "railsignal.max-block-length"}
 
 
 def obeying(folder: Path, options: str, signals: str, stops: str = "") -> Model:
@@ -192,6 +192,18 @@ def test_a_stop_short_of_the_end_of_its_place_is_made_there_as_in_sumo(read, tmp
     assert [s.position_m for s in stops] == [float(s["pos"]) for s in plain(tmp_path, "stop")] == [600.0, 700.0]
 
 
+def test_stops_of_a_repeated_route_that_is_the_trains_own_are_made_once_as_in_sumo(read, tmp_path) -> None:
+    edges = {"ab": ("a", "b"), "bc": ("b", "c"), "ca": ("c", "a")}
+    read()  # the net is another one
+    nets.net(tmp_path, {"a": (0, 0), "b": (2000, 0), "c": (1000, 2000)}, edges)
+    route = '<route edges="ab bc ca" repeat="1"><stop lane="bc_0" endPos="500" duration="10"/></route>'
+    body = f'<vehicle id="v" type="emu" depart="0">{route}<stop lane="ca_0" endPos="700" duration="10"/></vehicle>'
+    nets.traffic(tmp_path, body)
+    (train,) = read_traffic(tmp_path / "a.sumocfg", tmp_path / "work").departures
+    assert [(s.edge, s.first) for s in train.stops] == [("bc", 0), ("ca", 0)]
+    assert [row["lane"] for row in plain(tmp_path, "stop")] == ["bc_0", "ca_0"]
+
+
 def test_no_stop_is_lost_in_silence(read) -> None:
     with pytest.raises(InputError) as caught:
         read(nets.train("v", WAY, 0, '<stop lane="bc_0" endPos="0" duration="10"/>'))
@@ -268,6 +280,20 @@ def test_what_a_rerouter_says_that_is_not_followed_is_named(read, tmp_path, attr
     (tmp_path / "r.add.xml").write_text(f"<additional>{rerouter}</additional>")
     traffic = read(options='<additional-files value="r.add.xml"/>')
     assert "<rerouter>: 1" in traffic.followed and traffic.notes == ((told,) if told else ())
+
+
+@pytest.mark.parametrize(("times", "sorted_"), [((0, 9), True), ((9, 9), True), ((9, 0), False)])
+def test_steps_of_a_sign_that_sumo_refuses_are_refused(read, tmp_path, times, sorted_) -> None:
+    steps = "".join(f'<step time="{t}" speed="9"/>' for t in times)
+    (tmp_path / "v.add.xml").write_text(
+        f'<additional><variableSpeedSign id="s" lanes="ab_0">{steps}</variableSpeedSign></additional>'
+    )
+    try:
+        read(options='<additional-files value="v.add.xml"/>')
+    except InputError as error:
+        assert error.mistakes == [f"{tmp_path / 'a.sumocfg'}: variableSpeedSign s: steps must be sorted by time"] and not sorted_
+    else:
+        assert sorted_
 
 
 def test_a_rerouter_that_ends_routes_is_refused(read, tmp_path) -> None:
