@@ -119,8 +119,9 @@ def read_options(sumocfg: Path) -> dict[str, str]:
     said: dict[str, str] = {}
     wrong = []
     for element in root.iter():
-        # SUMO takes the text of an element for its value, too.
-        value = element.get("value", element.get("v", (element.text or "").strip() or None))
+        # SUMO takes the text of an element for its value, too, but for that of a group.
+        text = "" if len(element) else (element.text or "").strip()
+        value = element.get("value", element.get("v", text or None))
         if value is None:
             continue
         key = _named(element.tag)

@@ -50,7 +50,7 @@ def notes(traffic: Configuration, word: str) -> list[str]:
 
 def test_an_option_may_stand_as_text_as_in_sumo(read, tmp_path) -> None:
     assert (
-        {d.id for d in read(options="<scale>2</scale>").departures}
+        {d.id for d in read(options="<processing>words<scale>2</scale></processing>").departures}
         == {row["id"] for row in plain(tmp_path, "tripinfo")}
         == {"v", "v.1"}
     )
