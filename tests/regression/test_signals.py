@@ -446,6 +446,27 @@ def test_a_green_that_can_no_longer_be_given_up_is_not_taken_back(tmp_path, monk
         assert order_of(at(found, "arrive")) == ["ours", "sumo"]
 
 
+def test_a_train_longer_than_its_block_keeps_its_green_from_one_that_comes_the_other_way(tmp_path):
+    """SUMO gives no such block before single track to both; it knows only the ways of trains that came before, so one more does."""
+    places = {"w0": (-3000, 0), "w": (0, 0), "m": (4000, 0), "p": (4300, 0), "q": (7300, 0), "e": (10300, 0), "o": (11300, 900),
+              "o0": (14300, 900), "r": (2000, -900)}  # fmt: skip
+    tracks = {
+        "west0": ("w0", "w"), "west": ("w", "m"), "main": ("m", "p"), **nets.both_ways("one", "p", "q"), "east": ("q", "e"),
+        "in0": ("o0", "o"), "in": ("o", "q"), "out": ("p", "r"),
+    }  # fmt: skip
+    nets.net(tmp_path, places, tracks, signals="wmpqo")
+    against = nets.train("early", "in -one out", 0) + nets.train("sumo", "in0 in -one out", 265, departSpeed=0)
+    nets.traffic(tmp_path, against + nets.train("ours", "west0 west main one east", 100), nets.EMU.replace("100", "600"))
+    made = nets.scenario(
+        "robust_constrained", 1400, run={"step_s": 10.0}, controller={"h_per_s": 0.05}, reference={"speed_mps": 15.0},
+        traffic={"cooperate": ["ours"], "others": "sumo"}, train_type={"emu": {**nets.TYPE, "unit_length_m": 600.0}},
+    )  # fmt: skip
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(made))
+    found = run(open_scenario(str(tmp_path / "s.toml")), tmp_path / "out")
+    told = [e["kind"] for e in found.events if e["kind"] in ("green_withdrawn", "red_passed", "violation", "gridlock")]
+    assert not told and order_of(at(found, "arrive")) == ["early", "ours", "sumo"]
+
+
 def test_a_parked_train_that_sumo_does_not_let_back_waits_and_says_so(tmp_path):
     """Its block is taken by a train of SUMO's that has come by meanwhile."""
     halt = '<stop lane="west_0" endPos="1000" duration="40" parking="true"/>'

@@ -93,14 +93,19 @@ def alone_on(rails: Rails, edge: int, signals: Collection[tuple[int, int]]) -> t
 
 
 def plain(rails: Rails, edge: int, signals: Collection[tuple[int, int]]) -> tuple[int, ...]:
-    """Edges from ``edge`` up to the next signal; () where a switch, a crossing or a track for both directions comes before it."""
+    """Edges from ``edge`` up to the next signal; () where a switch, a crossing or a track for both directions comes before it.
+
+    Also where such a track begins right behind it: SUMO lets no train that is longer than the edges before it up to that signal
+    while another comes the other way.
+    """
     found = [edge]
     while True:
         here = found[-1]
         if rails.twin[here] >= 0 or rails.crossing[here]:
             return ()
-        if not rails.after[here] or all((here, onward) in signals for onward in _normal_after(rails, here)):
-            return tuple(found)
+        behind = tuple(_normal_after(rails, here))
+        if all((here, onward) in signals for onward in behind):
+            return () if any(rails.twin[onward] >= 0 for onward in behind) else tuple(found)
         if len(rails.after[here]) > 1 or len(rails.before[rails.after[here][0]]) > 1 or rails.after[here][0] in found:
             return ()
         found.append(rails.after[here][0])

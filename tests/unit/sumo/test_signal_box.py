@@ -30,6 +30,21 @@ def test_up_to_the_next_signal_on_plain_track_nobody_else_comes(alone):
     assert alone("ab") == ["ab", "bc"]
 
 
+def test_who_comes_the_other_way_right_behind_a_block_may_want_what_its_signal_gives(tmp_path):
+    tracks = {
+        "ab": ("a", "b"),
+        "bc": ("b", "c"),
+        **nets.both_ways("cx", "c", "x"),
+        "xd": ("x", "d"),
+        "yx": ("y", "x"),
+        "cy": ("c", "y"),
+    }
+    nets.net(tmp_path, {k: v for k, v in NODES.items() if k in "abcxdy"}, tracks, signals="bcx")
+    rails = Rails.read(tmp_path / "a.net.xml")
+    signals = {(rails.index[s.edge], rails.index[s.onward]) for s in rail_signals(read_net(tmp_path / "a.net.xml"))}
+    assert alone_on(rails, rails.index["ab"], signals) == ()
+
+
 def test_before_a_join_and_on_track_for_both_directions_others_may_want_what_a_signal_gives(alone):
     assert alone("bc") == []
     assert alone("de") == []
@@ -87,6 +102,7 @@ def test_a_block_ends_at_the_next_signal_or_where_the_track_does(beyond, more, s
         ({"vx": ("v", "x")}, "m"),  # a join in the block
         (nets.both_ways("mx", "m", "x"), "mx"),  # a block for both directions
         (nets.both_ways("vm", "v", "m"), "mx"),  # an entry for both directions
+        (nets.both_ways("xy", "x", "y"), "mx"),  # and who comes the other way right behind the block
     ],
 )
 def test_where_a_block_is_no_plain_track_sumo_is_asked(beyond, more, signals):
