@@ -467,6 +467,17 @@ def test_a_train_longer_than_its_block_keeps_its_green_from_one_that_comes_the_o
     assert not told and order_of(at(found, "arrive")) == ["early", "ours", "sumo"]
 
 
+def test_a_train_that_sumo_kept_out_for_a_while_enters_so_that_it_can_stop_before_its_first_signal(tmp_path):
+    """Its block is taken by a train that stands behind its place, and then passes it; the signal is red to it after that."""
+    halt = '<stop lane="west0_0" endPos="1000" duration="60"/>'
+    join(tmp_path, nets.train("first", WEST, 0, halt) + nets.train("near", WEST, 20, departPos=2850))
+    found = ran(tmp_path, 700, signals="obey")
+    (came,) = (e for e in found.events if e["kind"] == "depart" and e["train"] == "near")
+    assert came["time_s"] > passed(found, "first", "west") and came["delay_s"] > 60.0
+    assert 0.0 <= came["speed_mps"] ** 2 < 2.0 * 150.0 and not amiss(found)
+    assert not [e for e in found.events if e["kind"] == "supervisor" and e["emergency"]]
+
+
 def test_a_parked_train_that_sumo_does_not_let_back_waits_and_says_so(tmp_path):
     """Its block is taken by a train of SUMO's that has come by meanwhile."""
     halt = '<stop lane="west_0" endPos="1000" duration="40" parking="true"/>'

@@ -83,7 +83,7 @@ class Signals:
         binding = self._binding(v)
         farthest = float(np.max(braking + 10.0 * step * v, where=seen.present, initial=0.0)) + BEYOND_M
         horizon = np.where(seen.present, farthest, self.entering)
-        sighted = aspects.sighted(ways, at, seen.row, seen.position, seen.present | ~traffic.came, horizon)
+        sighted = aspects.sighted(ways, at, seen.row, seen.position, seen.present | traffic.outside(seen), horizon)
         green = np.zeros(len(sighted.train), bool)
         known = seen.present[sighted.train]
         signals, which = np.unique(sighted.signal[known], return_inverse=True)
@@ -154,7 +154,7 @@ class Signals:
     ) -> None:  # fmt: skip
         """Keep trains that are not on the track off blocks that others can no longer stop before: those would get red."""
         due = self.p.roster.depart <= t + self.p.scenario.run.step_s + 1e-9
-        outside = (traffic.parked | ~traffic.came & due) & ~self.p.roster.driven
+        outside = (traffic.parked | traffic.outside(seen) & due) & ~self.p.roster.driven
         if not claims or not outside.any():
             return
         places = self._under(ways, seen, outside)

@@ -65,6 +65,11 @@ class State(NamedTuple):
         stands: Bools = ~(np.isnan(self.stands_until) & np.isnan(self.turns_since))
         return stands
 
+    def outside(self, seen: Seen) -> Bools:
+        """Trains that have yet to come: also those that were to be there by now, and that signals kept out."""
+        yet: Bools = ~self.came | self.entering & ~seen.present
+        return yet
+
     def on_track(self, seen: Seen) -> Seen:
         """Trains as they are to each other: who is parked is not there."""
         return seen._replace(present=seen.present & ~self.parked) if self.parked.any() else seen
