@@ -220,7 +220,9 @@ class Box:
             if held and self._behind_held(claim[1], held):
                 continue
             for rival in lights.getRivalVehicles(name, link):
-                ahead = self.session.api.vehicle.getNextTLS(rival)
+                # Held at one that it holds itself, and runs past in any case, it would lose its own green.
+                own = {self.obeyed.signals[q] for i, q in self.claims if self.session.ids[i] == rival}
+                ahead = [one for one in self.session.api.vehicle.getNextTLS(rival) if (one[0], one[1]) not in own]
                 red = [one[0] for one in ahead if one[3] not in "Gg"]  # one that has just come has green until it is asked for
                 trip = self.obeyed.handed.trips[self.number[rival]] if rival in self.number else rival
                 for at in (red or [one[0] for one in ahead])[:1]:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import nets
+import numpy as np
 import pytest
 
 from sumo_net import Rails
 from sumo_net.netfile import read_net
-from trainctl.sumo.signal_box import alone_on, entries
+from trainctl.sumo.signal_box import NOBODY, Box, alone_on, entries
 from trainctl.traffic.rail_signals import rail_signals
 
 #: A line with signals at b, c and e; at d another one joins, and its last edge can be run over both ways.
@@ -113,3 +117,33 @@ def test_where_tracks_cross_before_a_block_sumo_is_asked(beyond):
     places = {"w": (0, 0), "m": (1000, 0), "e": (2000, 0), "n": (1000, 1000), "s": (1000, -1000), "k": (0, -700)}
     tracks = {"wm": ("w", "m"), "me": ("m", "e"), "km": ("k", "m"), "nm": ("n", "m"), "ms": ("m", "s")}
     assert not beyond(tracks, "m", "wm", "me", places)
+
+
+class Lights:
+    """SUMO as far as a box asks it, of two trains: one is a rival at signal b of the other, and has green at all signals ahead."""
+
+    def __init__(self) -> None:
+        self.held: list[tuple[Any, ...]] = []
+
+    def getRivalVehicles(self, name: str, link: int) -> tuple[str, ...]:
+        return ("one",) if name == "b" else ()
+
+    def getNextTLS(self, train: str) -> tuple[tuple[str, int, float, str], ...]:
+        return (("a", 0, 20.0, "G"), ("c", 0, 900.0, "G"))
+
+    def addConstraint(self, *said: Any) -> None:
+        self.held.append(said)
+
+
+@pytest.mark.parametrize(("claims", "at"), [([[1, 1]], "a"), ([[0, 0], [1, 1]], "c")])
+def test_nobody_is_held_at_a_signal_that_it_cannot_stop_before_any_more(claims, at):
+    lights, edges = Lights(), SimpleNamespace(getLaneNumber=lambda edge: 1)
+    obeyed: Any = SimpleNamespace(
+        driven=np.zeros(2, bool), signals=(("a", 0), ("b", 0), ("c", 0)), alone=((), (), ()), entries=((), (), ()),
+        handed=SimpleNamespace(trips=("one", "other")),
+    )  # fmt: skip
+    session: Any = SimpleNamespace(ids=["one", "other"], api=SimpleNamespace(trafficlight=lights, vehicle=lights, edge=edges))
+    box = Box(session, obeyed, lambda name: "G")
+    box.claims = claims
+    box.hold()
+    assert lights.held == [(at, "one", "b", NOBODY, 0, 1)]
