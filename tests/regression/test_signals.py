@@ -303,6 +303,20 @@ def test_a_formation_holds_together_past_signals_with_moving_block_and_else_it_i
     assert not amiss(found)
 
 
+@pytest.mark.parametrize("internal", [True, False])
+@pytest.mark.parametrize("moving", ["true", "false"])
+def test_it_is_told_where_signals_of_moving_block_keep_nobody_apart_at_joins(tmp_path, internal, moving):
+    places = {"w": (-3000, 0), "s": (-3000, -900), "m": (0, 0), "x": (2000, 0), "e": (6000, 0)}
+    tracks = {"wm": ("w", "m"), "sm": ("s", "m"), "mx": ("m", "x"), "xe": ("x", "e")}
+    nets.net(tmp_path, places, tracks, *([] if internal else ["--no-internal-links"]), signals="mx")
+    nets.traffic(tmp_path, nets.train("a", "wm mx xe", 0) + nets.train("b", "sm mx xe", 0))
+    also(tmp_path, "", f'<processing><railsignal-moving-block value="{moving}"/></processing>')
+    made = nets.scenario("robust_constrained", 100, traffic={"cooperate": [], "signals": "obey"})
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(made))
+    told = [note for note in open_scenario(str(tmp_path / "s.toml")).roster.notes if "past a join at once" in note]
+    assert len(told) == (moving == "true" and not internal)
+
+
 @pytest.mark.parametrize(("signals", "taken"), [("wsmx", True), ("sm", False)])
 def test_no_train_is_rerouted_to_where_no_signal_would_hold_it(tmp_path, signals, taken):
     """A second way leaves at w and joins at x: only a signal at w holds trains before that."""

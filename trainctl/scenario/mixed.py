@@ -103,12 +103,27 @@ def _in_turn(again: Sequence[str]) -> list[str]:
 
 def of_formations(together: Bools, options: Mapping[str, str]) -> list[str]:
     """What signals do to formations of trains that cooperate (n,), where they are obeyed; ``options`` are those of the files."""
-    if together.sum() < 2 or options.get("railsignal-moving-block", "false").lower() in ("true", "1", "yes", "on"):
+    if together.sum() < 2 or _moving(options):
         return []
     return [
         f"traffic.signals = obey: a signal lets one train at a time into its block, so it draws formations of the {together.sum()}"
         " trains that cooperate apart; SUMO's option railsignal-moving-block lets them pass together"
     ]
+
+
+def at_joins(rails: Rails, options: Mapping[str, str]) -> list[str]:
+    """Whether signals that are obeyed keep no trains apart at joins; ``options`` are those of the files."""
+    if rails.internal.any() or not _moving(options) or all(len(before) < 2 for before in rails.before):
+        return []
+    return [
+        "option railsignal-moving-block: on a net without internal edges SUMO's signals let trains from two tracks past a join at"
+        " once: make the net with internal edges"
+    ]
+
+
+def _moving(options: Mapping[str, str]) -> bool:
+    """Whether SUMO's signals are to be those of moving block."""
+    return options.get("railsignal-moving-block", "false").lower() in ("true", "1", "yes", "on")
 
 
 def unguarded(ways: Sequence[Ints], ids: Sequence[str], rails: Rails, signals: Sequence[Signal]) -> list[str]:

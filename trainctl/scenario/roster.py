@@ -273,6 +273,7 @@ def enrol(scenario: Scenario, folder: Path) -> tuple[Scenario, Roster, Path]:
             later = trips_of_stops(traffic.source, [name for name, other in zip(ids, driven.tolist(), strict=True) if not other])
             bad, notes = mixed.unkept(traffic.source.elements.others, traffic.signals, given.trips, later)
             found, told = [*found, *wrong, *bad], [*told, *notes, *mixed.of_formations(together, traffic.source.options)]
+            told += mixed.at_joins(rails, traffic.source.options)
         else:
             size = np.array([types[d.kind].per_unit("unit_length_m").sum() for d in traffic.departures])
             margin = (scenario.supervisor or supervisor.Params()).margin_m + DRIVER_MARGIN_M
