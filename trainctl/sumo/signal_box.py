@@ -212,8 +212,11 @@ class Box:
         """
         lights, claims = self.session.api.trafficlight, {(i, q) for i, q in self.claims if self._contested(q)}
         for claim in self.held.keys() - claims:
-            for at, trip in sorted(self.held.pop(claim)):
-                lights.removeConstraints(at, trip, self.obeyed.signals[claim[1]][0], NOBODY)
+            name, gone = self.obeyed.signals[claim[1]][0], self.held.pop(claim)
+            # SUMO takes off all that are alike, so also what another claim at the same junction holds the same train by.
+            kept = {one for (_, q), held in self.held.items() if self.obeyed.signals[q][0] == name for one in held}
+            for at, trip in sorted(gone - kept):
+                lights.removeConstraints(at, trip, name, NOBODY)
         for claim in sorted(claims):
             name, link = self.obeyed.signals[claim[1]]
             held = self.held.setdefault(claim, set())

@@ -120,7 +120,7 @@ def test_where_tracks_cross_before_a_block_sumo_is_asked(beyond):
 
 
 class Lights:
-    """SUMO as far as a box asks it, of two trains: one is a rival at signal b of the other, and has green at all signals ahead."""
+    """SUMO as far as a box asks it: one train is a rival of others at the signals of junction b, and has green at all ahead of it."""
 
     def __init__(self) -> None:
         self.held: list[tuple[Any, ...]] = []
@@ -132,18 +132,36 @@ class Lights:
         return (("a", 0, 20.0, "G"), ("c", 0, 900.0, "G"))
 
     def addConstraint(self, *said: Any) -> None:
-        self.held.append(said)
+        self.held.append(said[:4])
+
+    def removeConstraints(self, *said: Any) -> None:
+        self.held = [one for one in self.held if one != said]
+
+
+@pytest.fixture
+def box():
+    lights = Lights()
+    obeyed: Any = SimpleNamespace(
+        driven=np.zeros(3, bool), signals=(("a", 0), ("b", 0), ("b", 1)), alone=((), (), ()), entries=((), (), ()),
+        handed=SimpleNamespace(trips=("one", "other", "third")), rails=SimpleNamespace(edges=()),
+    )  # fmt: skip
+    edges = SimpleNamespace(getLaneNumber=lambda edge: 1)
+    session: Any = SimpleNamespace(
+        ids=["one", "other", "third"], api=SimpleNamespace(trafficlight=lights, vehicle=lights, edge=edges)
+    )
+    return Box(session, obeyed, lambda name: "G"), lights
 
 
 @pytest.mark.parametrize(("claims", "at"), [([[1, 1]], "a"), ([[0, 0], [1, 1]], "c")])
-def test_nobody_is_held_at_a_signal_that_it_cannot_stop_before_any_more(claims, at):
-    lights, edges = Lights(), SimpleNamespace(getLaneNumber=lambda edge: 1)
-    obeyed: Any = SimpleNamespace(
-        driven=np.zeros(2, bool), signals=(("a", 0), ("b", 0), ("c", 0)), alone=((), (), ()), entries=((), (), ()),
-        handed=SimpleNamespace(trips=("one", "other")),
-    )  # fmt: skip
-    session: Any = SimpleNamespace(ids=["one", "other"], api=SimpleNamespace(trafficlight=lights, vehicle=lights, edge=edges))
-    box = Box(session, obeyed, lambda name: "G")
+def test_nobody_is_held_at_a_signal_that_it_cannot_stop_before_any_more(box, claims, at):
+    box, lights = box
     box.claims = claims
     box.hold()
-    assert lights.held == [(at, "one", "b", NOBODY, 0, 1)]
+    assert lights.held == [(at, "one", "b", NOBODY)]
+
+
+def test_who_is_held_for_two_trains_at_one_junction_waits_for_both(box):
+    box, lights = box
+    for box.claims, held in (([[1, 1], [2, 2]], True), ([[2, 2]], True), ([], False)):
+        box.hold()
+        assert bool(lights.held) is held, box.claims
