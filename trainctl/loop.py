@@ -120,7 +120,8 @@ class Loop(Steps):
 
         # traffic: departures, stops -> entries; whose turn it is; what is ahead of every train, where it is needed
         late = self.plant.overrun(own, p.driver_braking)
-        going, around = self.traffic.step(t, ways, here, speed, late, s.traffic, red=red)
+        stopped = None if world.box is None else world.box.stopped()
+        going, around = self.traffic.step(t, ways, here, speed, late, s.traffic, red=red, stopped=stopped)
         for i, v in around.entries:
             own[p.consists.first[i] : p.consists.first[i + 1], SPEED] = v
             world.insert(i, v)
@@ -192,7 +193,8 @@ class Loop(Steps):
         late = self.plant.overrun(own, self.p.driver_braking)
         speed = own[self.p.leading, SPEED].copy()
         _, red = self.signals.step(t, ways, here, speed, s.traffic, world.box, s.signals)
-        going, around = self.traffic.step(t, ways, here, speed, late, s.traffic, last=True, red=red)
+        stopped = None if world.box is None else world.box.stopped()
+        going, around = self.traffic.step(t, ways, here, speed, late, s.traffic, last=True, red=red, stopped=stopped)
         seen = here._replace(position=here.position + s.formed.offset)
         rule, formed, messages, own, seen, scene = self.topology.step(
             t, seen, own, around, going, s.rule, s.formed, s.messages

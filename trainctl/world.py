@@ -26,6 +26,9 @@ class SignalBox(Protocol):
     def speeds(self) -> Floats:
         """Speed of every train that it drives itself [m/s], shape (n,), NaN for the others."""
 
+    def stopped(self) -> Bools:
+        """Which trains that it drives itself stand at a stop, shape (n,)."""
+
 
 class World(Protocol):
     """The simulator as the loop needs it."""

@@ -502,3 +502,15 @@ def test_a_parked_train_that_sumo_does_not_let_back_waits_and_says_so(tmp_path):
     assert waits["place"] == "parked" and waits["other"] is None and waits["time_s"] > waits["since_s"] + 20.0 > reached + 60.0
     assert passed(found, "sumo", "main") < left < passed(found, "sumo", "main") + 30.0 and left > reached + 60.0
     assert not amiss(found) and found.ok and order_of(at(found, "arrive")) == ["sumo", "ours"]
+
+
+@pytest.mark.parametrize("end", [700, 740])
+def test_a_train_of_sumos_is_parked_as_soon_as_sumo_says_so_though_it_still_moves(tmp_path, end):
+    """SUMO takes it off its track at less than 0.1 m/s, as in the second case, and lets in who waits for its place in that step."""
+    park = f'<stop lane="in_0" endPos="{end}" duration="60" parking="true"/>'
+    nets.net(tmp_path, {"a": (0, 0), "b": (2000, 0), "c": (6000, 0)}, {"in": ("a", "b"), "out": ("b", "c")}, signals="b")
+    body = nets.train("c", "out", 0) + nets.train("a", "in out", 0, park, departSpeed="max")
+    slow = '<vType id="emu" vClass="rail" length="100" maxSpeed="15" decel="0.5" accel="0.4"/>'
+    nets.traffic(tmp_path, body + nets.train("b", "in out", 1, departPos=end - 20), slow)
+    found = ran(tmp_path, 120, signals="obey", others="sumo", cooperate=["c"])
+    assert not amiss(found) and at(found, "stop_reached")["a"] == at(found, "depart")["b"]

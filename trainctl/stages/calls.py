@@ -36,8 +36,14 @@ def calls(stops: Sequence[Sequence[Stop]]) -> Calls:
     )  # fmt: skip
 
 
+def stand(speed: Floats, driven: Bools, stopped: Bools | None) -> Bools:
+    """Which trains stand, (n,); of those that the simulator drives, which it says to be ``stopped`` (None: it drives none)."""
+    slow = speed < STANDS_MPS
+    return slow if stopped is None else np.where(driven, stopped, slow)
+
+
 def on_the_way(
-    known: Calls, trains: Ints, next_stop: Ints, leg: Ints, position: Floats, speed: Floats, standing: Bools
+    known: Calls, trains: Ints, next_stop: Ints, leg: Ints, position: Floats, stands: Bools, standing: Bools
 ) -> tuple[Bools, Floats]:  # fmt: skip
     """Which trains just run on towards the next stop, where they are to stand, and the room to it [m], (k,) each.
 
@@ -49,14 +55,14 @@ def on_the_way(
         Those that are asked for; they have a stop left.
     next_stop, leg : ndarray, shape (n,)
         Stops and turns made.
-    position, speed : ndarray, shape (n,)
-        Fronts [m] and speeds [m/s].
-    standing : ndarray, shape (n,)
-        Who is at a stop.
+    position : ndarray, shape (n,)
+        Fronts [m].
+    stands, standing : ndarray, shape (n,)
+        Who does not move; who is at a stop.
     """
     at = known.first[trains] + next_stop[trains]
     room = known.place[at] - position[trains]
-    runs = ~standing[trains] & ~((speed[trains] < STANDS_MPS) & (room < STOP_BAND_M))
+    runs = ~standing[trains] & ~(stands[trains] & (room < STOP_BAND_M))
     runs &= ~(known.passes[at] | known.parks[at] | np.isnan(room)) & (known.leg[at] <= leg[trains])
     return runs, room
 

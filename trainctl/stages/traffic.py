@@ -133,12 +133,13 @@ class Traffic:
 
     def step(
         self, t: float, ways: Ways, seen: Seen, speed: Floats, overrun: Floats, s: State, last: bool = False,
-        red: EndOfAuthority | None = None,
+        red: EndOfAuthority | None = None, stopped: Bools | None = None,
     ) -> tuple[State, Around]:  # fmt: skip
         """Arrivals, stops, entries; ``overrun`` (n,) is how much farther trains run than their brakes promise [m].
 
         Who is due at the end of the coming step is let in now, and is there then: in time. ``speed`` (n,) gets the speeds of trains
-        that enter; at the ``last`` instant of a run none does. ``red`` is how far signals let each train go, where they decide.
+        that enter; at the ``last`` instant of a run none does. ``red`` is how far signals let each train go, where they decide;
+        ``stopped`` (n,) which of the simulator's own trains are at a stop.
         """
         s = self.departures(t, seen, speed, self.arrivals(t, seen, s))
         if not self.looks:
@@ -148,7 +149,7 @@ class Traffic:
         stood = s.standing & seen.present
         for i in [] if s.came.all() else np.flatnonzero(~s.came & self._given_up(t) & ~self._given_up(t - self.step_s)).tolist():
             self.journal.event(t, "given_up", train=self.p.scenario.ids[i], planned_s=float(self.roster.depart[i]))
-        s, stops, soon = self._stops(t, seen, speed, overrun, s)
+        s, stops, soon = self._stops(t, seen, speed, stopped, overrun, s)
         if last:
             self._uncalled(s)
         later = t + self.step_s
@@ -352,23 +353,25 @@ class Traffic:
         """How far beyond a stop a train comes to a standstill that passes it as fast as it may [m]; 0 if it is to stop there."""
         return float(self.stopping(np.array([i]), np.array([stop.passing]))[0]) if stop.passing else 0.0
 
-    def _stops(self, t: float, seen: Seen, speed: Floats, overrun: Floats, s: State) -> tuple[State, tuple[Ints, Floats], Bools]:
+    def _stops(
+        self, t: float, seen: Seen, speed: Floats, stopped: Bools | None, overrun: Floats, s: State
+    ) -> tuple[State, tuple[Ints, Floats], Bools]:  # fmt: skip
         """Arrive at and leave stops; the trains that have one ahead and the room to it [m], and who stops soon."""
-        trains, rooms, n = list[int](), list[float](), len(speed)
+        trains, rooms, n, ids = list[int](), list[float](), len(speed), self.p.scenario.ids
         if not (self.calls.number.any() or self.turns.any):
             return s, nothing(n).stops, np.zeros(n, bool)
-        standing = ~np.isnan(s.stands_until)
+        standing, stands = ~np.isnan(s.stands_until), calls.stand(speed, self.roster.driven, stopped)
         s = s._replace(
             next_stop=s.next_stop.copy(), stands_since=s.stands_since.copy(), stands_until=s.stands_until.copy(),
             late=s.late.copy(), stopping=s.stopping.copy(), parked=s.parked.copy(),
         )  # fmt: skip
         asked = np.flatnonzero(seen.present & (s.next_stop < self.calls.number))
-        plain, ahead = calls.on_the_way(self.calls, asked, s.next_stop, s.leg, seen.position, speed, standing)
+        plain, ahead = calls.on_the_way(self.calls, asked, s.next_stop, s.leg, seen.position, stands, standing)
         plain &= ~np.isin(asked, list(self.turns.yards))  # who is to turn may have to stand before its stop
         for i in asked[~plain].tolist():
             stop = self.stop_of(i, s)
             while stop is not None and np.isnan(stop.place):
-                self.journal.event(t, "stop_dropped", train=self.p.scenario.ids[i], stop=stop.name)
+                self.journal.event(t, "stop_dropped", train=ids[i], stop=stop.name)
                 s.next_stop[i] += 1
                 stop = self.stop_of(i, s)
             if stop is None:
@@ -377,11 +380,11 @@ class Traffic:
             room = self._place(stop, i, s) - float(seen.position[i])
             if standing[i]:
                 stays = t < s.stands_until[i] - 1e-9 or s.parked[i]
-                if speed[i] < STANDS_MPS if self.roster.driven[i] else stays:  # SUMO ends the stops of its own trains
+                if stands[i] if self.roster.driven[i] else stays:  # SUMO ends the stops of its own trains
                     continue
                 s.parked[i] = False
                 late = self._called(i, stop, float(s.stands_since[i]), t, int(seen.edge[i]), s)
-                self.journal.event(t, "stop_left", train=self.p.scenario.ids[i], stop=stop.name, **_late(late))
+                self.journal.event(t, "stop_left", train=ids[i], stop=stop.name, **_late(late))
                 s.stands_since[i] = s.stands_until[i] = np.nan
                 stop = self.stop_of(i, s)
                 if stop is None:
@@ -390,19 +393,17 @@ class Traffic:
                 room = self._place(stop, i, s) - float(seen.position[i])
             while stop is not None and stop.passing and room <= 0.0:
                 late = self._called(i, stop, t, t, int(seen.edge[i]), s)
-                self.journal.event(
-                    t, "waypoint", train=self.p.scenario.ids[i], stop=stop.name, speed_mps=float(speed[i]), **_late(late)
-                )  # fmt: skip
+                self.journal.event(t, "waypoint", train=ids[i], stop=stop.name, speed_mps=float(speed[i]), **_late(late))
                 stop = self.stop_of(i, s)
                 room = self._place(stop, i, s) - float(seen.position[i]) if stop is not None else np.inf
             if stop is None:
                 s.stopping[i] = False
                 continue
-            if not stop.passing and speed[i] < STANDS_MPS and room < STOP_BAND_M and not self._full(stop, s):
+            if not stop.passing and stands[i] and room < STOP_BAND_M and not self._full(stop, s):
                 s.stands_since[i], s.stands_until[i] = t, max(t + stop.duration, stop.until)
                 more = _late(t - stop.planned) | ({"parked": True} if stop.parks else {})
                 short = stop.place - float(seen.position[i])
-                self.journal.event(t, "stop_reached", train=self.p.scenario.ids[i], stop=stop.name, short_m=short, **more)
+                self.journal.event(t, "stop_reached", train=ids[i], stop=stop.name, short_m=short, **more)
                 s.parked[i] = stop.parks
                 continue
             beyond = self.turns.last_place(i) - float(seen.position[i]) - float(overrun[i])

@@ -32,6 +32,9 @@ NOT_WITH_SIGNALS = ("insertion-checks", "default.speeddev")
 #: Length of the place at the end of an edge at which SUMO holds a train that is to turn [m].
 HOLD_M = 0.1
 
+#: Whoever is faster is at no stop [m/s]: SUMO takes a train for stopped from 0.1 m/s on.
+SLOW_MPS = 0.2
+
 
 class Obeyed(NamedTuple):
     """What a session needs to know where signals are obeyed."""
@@ -182,7 +185,7 @@ class Box:
         self.session, self.obeyed, self.state = session, obeyed, state
         self.number = {name: i for i, name in enumerate(session.ids)}
         self.own = np.flatnonzero(obeyed.driven)
-        self.speed = np.full(len(session.ids), np.nan)
+        self.speed, self.stands = np.full(len(session.ids), np.nan), np.zeros(len(session.ids), bool)
         self.parked: list[int] = []
         self.claims: list[list[int]] = []
         self.contested: dict[int, bool] = {}  # by signal, as far as it was asked for
@@ -273,19 +276,24 @@ class Box:
         """Speeds of the trains that SUMO drives [m/s], NaN of the others."""
         return self.speed
 
+    def stopped(self) -> Bools:
+        """Which of the trains that SUMO drives stand at a stop, (n,): some still move as they reach it."""
+        return self.stands
+
     def read(self) -> Read:
         """Where the trains that SUMO drives are now; the session's ways and rows follow those that it leads another way."""
         vehicle, session = self.session.api.vehicle, self.session
         there = set(vehicle.getIDList()) if len(self.own) else set()
         present = np.array([session.ids[i] in there for i in self.own.tolist()], bool)
         row, position = session.seen.row[self.own].copy(), session.seen.position[self.own].copy()
-        self.speed[self.own] = 0.0
+        self.speed[self.own], self.stands[self.own] = 0.0, False
         for k in np.flatnonzero(present).tolist():
             i = int(self.own[k])
             name = session.ids[i]
             row[k] = row_of(session, self.obeyed.rails, i, vehicle.getRoadID(name))
             position[k] = session.ways.begin[row[k]] + vehicle.getLanePosition(name)
             self.speed[i] = vehicle.getSpeed(name)
+            self.stands[i] = self.speed[i] < SLOW_MPS and vehicle.isStopped(name)
         return Read(self.own, row, position, present)
 
 
