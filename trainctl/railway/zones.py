@@ -122,8 +122,15 @@ class Trains(NamedTuple):
         return found
 
     def before(self, queues: dict[int, list[int]]) -> deadlock.Before:
-        """Who comes before whom, see ``deadlock.Before``."""
-        return lambda j, m, i, k: self.goes_before(j, m, i, k, queues)
+        """Who comes before whom, see ``deadlock.Before``; each is worked out once, though it is asked for many times."""
+        known: dict[tuple[int, int, int, int], bool] = {}
+
+        def asked(j: int, m: int, i: int, k: int) -> bool:
+            if (found := known.get((j, m, i, k))) is None:
+                found = known[j, m, i, k] = self.goes_before(j, m, i, k, queues)
+            return found
+
+        return asked
 
     def track(self, i: int, k: int) -> int:
         """Edge over which ``i`` comes to that of row k; -1: it begins there."""
@@ -135,16 +142,17 @@ class Trains(NamedTuple):
 
     def goes_before(self, i: int, k: int, j: int, m: int, queues: dict[int, list[int]]) -> bool:
         """Whether ``i`` comes before ``j`` to the edge at their rows k and m, by where they are or by their turns before it."""
-        edge = self.zones.ways.edge
-        nearer = (self.distance(i, k), i) < (self.distance(j, m), j)
-        while k > self.row[i] and m > self.row[j]:
-            if edge[k - 1] != edge[m - 1]:
-                turns = queues.get(int(edge[k]), [])
+        edge, back, last = self.zones.ways.edge, 0, min(k - int(self.row[i]), m - int(self.row[j]))
+        while back < last:
+            if edge[k - back - 1] != edge[m - back - 1]:
+                turns = queues.get(int(edge[k - back]), [])
                 if i in turns and j in turns:
                     return turns.index(i) < turns.index(j)
-                return i in turns or (j not in turns and nearer)
-            k, m = k - 1, m - 1
-        return nearer
+                if i in turns or j in turns:
+                    return i in turns
+                break
+            back += 1
+        return (self.distance(i, k), i) < (self.distance(j, m), j)
 
 
 class Index:
