@@ -95,7 +95,7 @@ def out(loop: Loop) -> None:
         loop.step()
 
 
-@pytest.mark.parametrize("seed", [0, 1, 94, 120, 228])
+@pytest.mark.parametrize("seed", [1, 94, 120, 228])
 def test_everybody_gets_out(tmp_path, seed):
     """In 94 two wait before a join that becomes free to both at once; in 120 one is kept out by one that waits for it; in 228 a train
     comes to a join after a slow one that let a fast one pass, and saw that one only."""
