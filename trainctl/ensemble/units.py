@@ -73,7 +73,8 @@ def count(stack: Stack, fixed: Watched, row: Row, tally: Tally, counts: Counts) 
     x = row.extremes
     if x is None:
         return
-    now = {name: value(columns.units(columns.instant(row), stack.model.consists)) for name, value in columns.UNITS.items()}
+    seen = columns.units(columns.instant(row), stack.model.consists)
+    now = {name: value(seen) for name, value in columns.UNITS.items()}
     for k, least, most, instant in (
         (COUPLER, now["coupler_min_m"], now["coupler_max_m"], now["coupler_m"]),
         (COUPLER_FORCE, now["coupler_force_n"], now["coupler_force_n"], now["coupler_force_n"]),
