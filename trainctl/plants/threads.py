@@ -19,8 +19,9 @@ THREADS = "TRAINCTL_THREADS"
 #: A thread takes at least so many trains: for fewer it is not worth the 50 us of a call.
 LEAST = 64
 
-#: Trains are integrated so many at a time, or a formation: few enough for the cache, enough to share the calls.
-TOGETHER = 64
+#: Trains are integrated so many at a time, or a formation: few enough for the cache, enough to share the calls. If they are many,
+#: and may be cut anywhere, up to ``MOST``, two lots to a thread.
+TOGETHER, MOST = 64, 256
 
 
 class Shares(NamedTuple):
@@ -64,9 +65,9 @@ def shares(first: Ints, links: Links, talk: bool, threads: int) -> Shares:
         np.add.at(crossed, np.minimum(links.sender, links.receiver) + 1, 1)
         np.add.at(crossed, np.maximum(links.sender, links.receiver) + 1, -1)
     cuts = np.flatnonzero(np.cumsum(crossed)[: n + 1] == 0)
-    bounds = [0]
+    bounds, lot = [0], TOGETHER if talk else max(TOGETHER, min(MOST, n // (2 * threads)))
     for cut in cuts.tolist():
-        if cut - bounds[-1] >= TOGETHER:
+        if cut - bounds[-1] >= lot:
             bounds.append(cut)
     blocks = np.array([*bounds, *([n] if bounds[-1] < n else [])], np.int64)
     number = max(min(threads, n // LEAST), 1)
