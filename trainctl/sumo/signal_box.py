@@ -220,6 +220,9 @@ class Box:
             kept = {one for (_, q), held in self.held.items() if self.obeyed.signals[q][0] == name for one in held}
             for at, trip in sorted(gone - kept):
                 lights.removeConstraints(at, trip, name, NOBODY)
+        given: dict[str, set[tuple[str, int]]] = {}  # by train: what it holds itself
+        for i, q in self.claims if claims else ():
+            given.setdefault(self.session.ids[i], set()).add(self.obeyed.signals[q])
         for claim in sorted(claims):
             name, link = self.obeyed.signals[claim[1]]
             held = self.held.setdefault(claim, set())
@@ -227,7 +230,7 @@ class Box:
                 continue
             for rival in lights.getRivalVehicles(name, link):
                 # Held at one that it holds itself, and runs past in any case, it would lose its own green.
-                own = {self.obeyed.signals[q] for i, q in self.claims if self.session.ids[i] == rival}
+                own = given.get(rival, ())
                 ahead = [one for one in self.session.api.vehicle.getNextTLS(rival) if (one[0], one[1]) not in own]
                 red = [one[0] for one in ahead if one[3] not in "Gg"]  # one that has just come has green until it is asked for
                 trip = self.obeyed.handed.trips[self.number[rival]] if rival in self.number else rival
