@@ -33,7 +33,7 @@ from pydantic import Field
 from trainctl import draws
 from trainctl.contracts import UnitPlant
 from trainctl.davis import running_resistance
-from trainctl.kernels import inlined
+from trainctl.kernels import bare, inlined
 from trainctl.plants import coupled_units
 from trainctl.plants.coupled_units import (
     BRAKING,
@@ -202,10 +202,8 @@ def balanced(own: Floats, consists: Consists, gradient: Floats | None = None) ->
     state = np.zeros((len(own), STATES))
     state[:, :FORCE] = own[:, :FORCE]
     still = constants(Params(), consists, gradient)
-    out, power = np.zeros_like(state), np.zeros(6)
-    for i in range(len(consists.first) - 1):
-        rows = slice(consists.first[i], consists.first[i + 1])
-        rate(i, still, 0.0, 0.0, state[rows], np.zeros(rows.stop - rows.start), out[rows], power)
+    out = np.zeros_like(state)
+    _rates(still, 0.0, state, np.zeros(len(state)), out, np.zeros(6))
     state[:, FORCE] = np.where(state[:, SPEED] > 0.0, -out[:, SPEED] * consists.mass * consists.rotating, 0.0)
     return state
 
@@ -288,20 +286,32 @@ def fault(constants: Constants, t: float, applied: Floats) -> Floats:
         Demanded forces after the limits [N].
     """
     out = np.empty(len(applied))
-    for u, unit in enumerate(constants.units):
+    _faults(constants, t, applied, out)
+    return out
+
+
+@bare(error_model="numpy")
+def _faults(constants: Constants, t: float, applied: Floats, out: Floats) -> None:
+    for u in range(len(applied)):
+        unit = constants.units[u]
         lost = (1.0 - effectiveness(constants.faults, u, t)) * unit[RATE] * applied[u]
         out[u] = (fault_rate(constants.faults, u, t, t) - lost) / unit[INERTIA]
-    return out
+
+
+@bare(error_model="numpy")
+def _rates(constants: Constants, t: float, own: Floats, applied: Floats, out: Floats, power: Floats) -> None:
+    """``rate`` of all trains; ``power`` (6,) is work space."""
+    for i in range(len(constants.first) - 1):
+        a, b = constants.first[i], constants.first[i + 1]
+        rate(i, constants, t, t, own[a:b], applied[a:b], out[a:b], power)
 
 
 def columns(
     constants: Constants, t: float, own: Floats, applied: Floats, fault_estimate: Floats, acceleration_estimate: Floats
 ) -> tuple[Floats, ...]:
     """Values of ``COLUMNS`` at ``t``, (U,) each."""
-    out, power = np.empty_like(own), np.empty(6)
-    for i in range(len(constants.first) - 1):
-        rows = slice(constants.first[i], constants.first[i + 1])
-        rate(i, constants, t, t, own[rows], applied[rows], out[rows], power)
+    out = np.empty_like(own)
+    _rates(constants, t, own, applied, out, np.empty(6))
     return applied, fault(constants, t, applied), fault_estimate, out[:, SPEED], acceleration_estimate
 
 
