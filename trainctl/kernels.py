@@ -81,6 +81,14 @@ def _base() -> Path:
     return place
 
 
+def sources() -> list[Path]:
+    """Files of which something is compiled into code that stands in another file."""
+    here = Path(__file__).parent
+    folders, files = ("plants", "controllers", "observers", "topology", "railway"), ("signals", "davis", "draws", "kernels")
+    constants = ("metrics/driving", "metrics/run", "metrics/traffic", "monitors/on_track")  # of what is counted of stacked runs
+    return sorted([*(p for f in folders for p in (here / f).glob("*.py")), *(here / f"{f}.py" for f in (*files, *constants))])
+
+
 def keep_by_sources() -> None:
     """Point numba's cache at a folder of this version of the sources, unless NUMBA_CACHE_DIR names one that can be written."""
     if given := os.environ.get("NUMBA_CACHE_DIR"):
@@ -88,9 +96,7 @@ def keep_by_sources() -> None:
             Path(given).mkdir(parents=True, exist_ok=True)
         if os.access(given, os.W_OK | os.X_OK):
             return
-    here = Path(__file__).parent
     digest = hashlib.sha256(numba.__version__.encode())
-    compiled = [p for part in ("plants", "controllers", "observers", "topology", "railway") for p in (here / part).glob("*.py")]
-    for path in sorted([*(here / f"{name}.py" for name in ("signals", "davis", "draws", "kernels")), *compiled]):
+    for path in sources():
         digest.update(path.read_bytes())
     config.CACHE_DIR = str(_base() / f"kernels-{digest.hexdigest()[:16]}")
