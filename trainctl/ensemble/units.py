@@ -8,18 +8,20 @@ import numpy as np
 
 from trainctl.ensemble.count import NOT_FINITE, Counts
 from trainctl.ensemble.stack import Stack
+from trainctl.kernels import bare
 from trainctl.loop import ASTRAY
 from trainctl.metrics.driving import ELECTRIC_BRAKE_FROM_MPS, JOULES_PER_KWH
 from trainctl.metrics.run import SLACK
 from trainctl.monitors import energy
 from trainctl.monitors.on_track import ROUNDING
-from trainctl.record import columns
-from trainctl.record.columns import finite
 from trainctl.runs.known import Range, facts_of
-from trainctl.signals import POWERS, Bools, Extremes, Floats, Ints, Row, Scene
+from trainctl.signals import POSITION, POWERS, SPEED, Bools, Consists, Extremes, Floats, Ints, Row, Scene
 
 #: Rows of ``Tally.low`` and ``Tally.high``.
 COUPLER, COUPLER_FORCE, FORCE = range(3)
+
+#: Columns of ``Extremes.energy``.
+TRACTION, BRAKING = POWERS.index("traction"), POWERS.index("braking")
 
 
 class Tally(NamedTuple):
@@ -36,14 +38,20 @@ class Tally(NamedTuple):
     energies: energy.State
 
 
-class Watched(NamedTuple):
-    """What does not change, and what the tally goes by."""
+class Kept(NamedTuple):
+    """Bounds that the tally goes by."""
 
     run: Ints  # (U,) of every unit
-    balance: energy.Balance
     limits: Range  # m, coupler bounds of the scenario
     known: Range  # m, the same as metrics have them
     constrained: Floats  # (lower and upper, N, q) bounds of what the law constrains
+
+
+class Watched(NamedTuple):
+    """What does not change, and what the tally goes by."""
+
+    kept: Kept
+    balance: energy.Balance
     names: tuple[str, ...]  # q
 
 
@@ -56,12 +64,9 @@ def watched(stack: Stack, scene: Scene) -> tuple[Watched, Tally]:
     bounds, known = p.scenario.bounds, facts_of(stack.runs[0].scenario.model_dump(mode="json", exclude_none=True))
     stated = bounds.coupler_lower_m is not None and bounds.coupler_upper_m is not None
     limits = (float(bounds.coupler_lower_m or 0.0), float(bounds.coupler_upper_m or 0.0)) if stated else (-np.inf, np.inf)
-    balance = energy.Balance(p)
-    fixed = Watched(
-        np.repeat(np.arange(len(stack.runs)), units // len(stack.runs)), balance, limits, known.coupler_m,
-        np.stack(p.law.watched_bounds(p.params, scene)) if names else free, names,
-    )  # fmt: skip
-    return fixed, Tally(
+    run, balance = np.repeat(np.arange(len(stack.runs)), units // len(stack.runs)), energy.Balance(p)
+    kept = Kept(run, limits, known.coupler_m, np.stack(p.law.watched_bounds(p.params, scene)) if names else free)
+    return Watched(kept, balance, names), Tally(
         np.full((3, units), np.inf), np.full((3, units), -np.inf), np.full((2, units), -np.inf), free[::-1].copy(),
         np.zeros((3, n)), np.zeros((2, units), bool), np.zeros((2, n, len(names)), bool), np.zeros(n, bool), balance.initial(),
     )  # fmt: skip
@@ -70,56 +75,69 @@ def watched(stack: Stack, scene: Scene) -> tuple[Watched, Tally]:
 def count(stack: Stack, fixed: Watched, row: Row, tally: Tally, counts: Counts) -> None:
     """Count an instant; of one that is not recorded ``row.extremes`` is None, and only the energies go on."""
     tally.balance[[i for i, _ in fixed.balance.violated(row, tally.energies)]] = True
-    x = row.extremes
-    if x is None:
-        return
-    seen = columns.units(columns.instant(row), stack.model.consists)
-    now = {name: value(seen) for name, value in columns.UNITS.items()}
-    for k, least, most, instant in (
-        (COUPLER, now["coupler_min_m"], now["coupler_max_m"], now["coupler_m"]),
-        (COUPLER_FORCE, now["coupler_force_n"], now["coupler_force_n"], now["coupler_force_n"]),
-        (FORCE, now["force_min_n"], now["force_max_n"], now["force_n"]),
-    ):
-        lowest, highest = np.fmin(finite(least), finite(instant)), np.fmax(finite(most), finite(instant))
-        np.fmin(tally.low[k], lowest, out=tally.low[k])
-        np.fmax(tally.high[k], highest, out=tally.high[k])
-        if k == COUPLER:
-            hit = (lowest - fixed.known[0] < -SLACK) | (fixed.known[1] - highest < -SLACK)
-            late = np.unique(fixed.run[hit])
-            counts.first[late] = np.fmin(counts.first[late], row.time)
-    force, power = now["force_n"], now["force_n"] * now["speed_mps"]
-    for k, (acts, size) in enumerate(((force > 0, power), (force < 0, -power))):
-        np.fmax(tally.power[k], np.where(acts, size, 0.0 * force), out=tally.power[k])
-    _constrained(fixed, x, tally)
-    tally.couplers[0] |= x.coupler_min < fixed.limits[0]
-    tally.couplers[1] |= x.coupler_max > fixed.limits[1]
-    traction, braking = (np.nan_to_num(x.energy[:, POWERS.index(name)]) for name in ("traction", "braking"))
-    tally.work[0] += traction
-    tally.work[1] += braking
-    tally.work[2] += np.where(row.speed > ELECTRIC_BRAKE_FROM_MPS, braking, 0.0)
+    if row.extremes is not None:
+        force = np.full(len(row.own), np.nan) if row.motion is None or row.motion.force is None else row.motion.force
+        _count(stack.model.consists, fixed.kept, row.time, row.own, force, row.extremes, tally, counts.first)
 
 
-def _constrained(fixed: Watched, x: Extremes, tally: Tally) -> None:
-    """What the law constrains."""
-    np.fmin(tally.watched[0], finite(x.watched_min), out=tally.watched[0])
-    np.fmax(tally.watched[1], finite(x.watched_max), out=tally.watched[1])
-    seen = x.watched_min <= x.watched_max
-    tally.constrained[0] |= seen & (x.watched_min < fixed.constrained[0] - ROUNDING)
-    tally.constrained[1] |= seen & (x.watched_max > fixed.constrained[1] + ROUNDING)
+@bare(error_model="numpy")
+def _count(consists: Consists, kept: Kept, t: float, own: Floats, force: Floats, x: Extremes, tally: Tally, late: Floats) -> None:
+    """Count what is recorded, as ``record.columns.UNITS`` has it. ``force`` (U,) [N] is NaN at the end; ``late``: ``Counts.first``.
+
+    What is NaN widens nothing, and what was never seen is infinite the other way round.
+    """
+    low, high, first = tally.low, tally.high, consists.first
+    for i in range(len(first) - 1):
+        for u in range(first[i], first[i + 1]):
+            f, v = force[u], own[u, SPEED]
+            _widen(low, high, FORCE, u, f, f)
+            _widen(low, high, FORCE, u, x.force_min[u], x.force_max[u])
+            if f == f:
+                tally.power[0, u] = max(tally.power[0, u], f * v if f > 0.0 else 0.0)
+                tally.power[1, u] = max(tally.power[1, u], -(f * v) if f < 0.0 else 0.0)
+            if u + 1 < first[i + 1]:
+                stretch, rate = own[u, POSITION] - own[u + 1, POSITION] - consists.length[u], v - own[u + 1, SPEED]
+                pull = consists.stiffness[u] * stretch + consists.damping[u] * rate
+                least, most = min(x.coupler_min[u], stretch), max(x.coupler_max[u], stretch)
+                _widen(low, high, COUPLER, u, least, most)
+                _widen(low, high, COUPLER_FORCE, u, pull, pull)
+                if least - kept.known[0] < -SLACK or kept.known[1] - most < -SLACK:
+                    late[kept.run[u]] = min(late[kept.run[u]], t) if late[kept.run[u]] == late[kept.run[u]] else t
+                tally.couplers[0, u] |= x.coupler_min[u] < kept.limits[0]
+                tally.couplers[1, u] |= x.coupler_max[u] > kept.limits[1]
+        tally.work[0, i] += x.energy[i, TRACTION]
+        tally.work[1, i] += x.energy[i, BRAKING]
+        if own[first[i], SPEED] > ELECTRIC_BRAKE_FROM_MPS:
+            tally.work[2, i] += x.energy[i, BRAKING]
+        for q in range(x.watched.shape[1]):
+            least, most = x.watched_min[i, q], x.watched_max[i, q]
+            tally.watched[0, i, q], tally.watched[1, i, q] = min(tally.watched[0, i, q], least), max(tally.watched[1, i, q], most)
+            if least <= most:
+                tally.constrained[0, i, q] |= least < kept.constrained[0, i, q] - ROUNDING
+                tally.constrained[1, i, q] |= most > kept.constrained[1, i, q] + ROUNDING
+
+
+@bare(inline="always")
+def _widen(low, high, k, u, least, most):  # type: ignore[no-untyped-def]
+    """Let row ``k`` of ``low`` and ``high`` enclose what lies from ``least`` to ``most`` at unit ``u``."""
+    if least < low[k, u]:
+        low[k, u] = least
+    if most > high[k, u]:
+        high[k, u] = most
 
 
 def check(fixed: Watched, own: Floats, estimate: Floats, counts: Counts) -> None:
     """Mark runs whose numbers are no longer finite, or whose observers have diverged."""
     wild = ~np.isfinite(own).all(axis=1)
     wild |= ~(np.abs(estimate) < ASTRAY).all(axis=1)
-    counts.fate[fixed.run[wild]] = NOT_FINITE
+    counts.fate[fixed.kept.run[wild]] = NOT_FINITE
 
 
 def violations(fixed: Watched, tally: Tally, runs: int) -> Ints:
     """Bounds that were violated, each once per coupler or train that did."""
     found = np.zeros(runs, np.int64)
     for side in range(2):
-        found += np.bincount(fixed.run[tally.couplers[side]], minlength=runs)
+        found += np.bincount(fixed.kept.run[tally.couplers[side]], minlength=runs)
         found += tally.constrained[side].reshape(runs, -1).sum(axis=1)
     found += tally.balance.reshape(runs, -1).sum(axis=1)
     return found
@@ -129,8 +147,8 @@ def margins(fixed: Watched, tally: Tally) -> dict[str, tuple[Floats, Ints]]:
     """Minimum margins of every coupler to its bounds, and the run of each; see ``metrics.run.of_bounds``."""
     with np.errstate(invalid="ignore"):
         return {
-            "coupler_lower_margin_m": (tally.low[COUPLER] - fixed.known[0], fixed.run),
-            "coupler_upper_margin_m": (fixed.known[1] - tally.high[COUPLER], fixed.run),
+            "coupler_lower_margin_m": (tally.low[COUPLER] - fixed.kept.known[0], fixed.kept.run),
+            "coupler_upper_margin_m": (fixed.kept.known[1] - tally.high[COUPLER], fixed.kept.run),
         }
 
 
