@@ -121,7 +121,7 @@ def add(lift, sign, a, b, applied):  # type: ignore[no-untyped-def]
             applied[u] += sign * lift[u]
 
 
-@bare(cache=False)
+@bare(cache=False, forceinline=True)
 def stage(code, loop, first, links, references, received, t, inside, own, estimate, work, low, high):  # type: ignore[no-untyped-def]
     """Evaluate the closed loop of trains ``low`` to ``high`` at one instant: fills ``work`` with forces and rates.
 
@@ -197,7 +197,7 @@ def exchange_kernel(code, loop, first, links, references, received, t, own, esti
         message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
 
 
-@bare(cache=False)
+@bare(cache=False, forceinline=True)
 def see(code, loop, first, length, links, references, t, inside, own, work, extremes, low, high):  # type: ignore[no-untyped-def]
     """Widen ``extremes`` of trains ``low`` to ``high`` by the state and the forces of this instant; what is NaN widens nothing."""
     watch = part(code, LAW, "watch")
