@@ -22,8 +22,8 @@ pack_array: Any = cgutils.pack_array
 #: Tables of units by their places in ``code``, behind the number of units of every train.
 UNITS, OWN, ESTIMATE, CORRECTION = range(4)
 
-#: So many trains are worth code of their own for their number of units.
-WORTH = 100
+#: So many trains are worth code of their own for their number of units: some runs side by side.
+WORTH = 24
 
 
 def numbers(first: Ints, own: Floats, estimate: Floats, correction: Floats) -> str:

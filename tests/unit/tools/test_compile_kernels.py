@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import contextlib
 import importlib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -25,6 +27,24 @@ def test_every_shipped_scenario_is_in_one_combination(tool):
 
 
 def test_a_combination_is_run_by_the_first_scenario_that_can_be_short(tool):
-    assert tool.compiled(["fully_distributed"]) is None
-    assert tool.compiled(["no_such", "fully_distributed"]) is None
-    assert tool.compiled(["no_such"]).startswith("no_such: ")
+    assert tool.compiled(["fully_distributed"], False) is None
+    assert tool.compiled(["no_such", "fully_distributed"], False) is None
+    assert tool.compiled(["no_such"], False).startswith("no_such: ")
+
+
+def test_continuous_laws_are_also_run_side_by_side(tool, monkeypatch):
+    jobs = list[tuple[list[str], bool]]()
+    monkeypatch.setattr(tool, "ProcessPoolExecutor", lambda *_: contextlib.nullcontext(SimpleNamespace(map=_noted(jobs))))
+    tool.main()
+    assert [names[0] for names, abreast in jobs if abreast] == ["fault_tolerant", "emu_finite_time"]
+    assert [names for names, abreast in jobs if not abreast] == list(tool.combinations().values())
+    assert tool.compiled(["emergency_stop", "emu_finite_time"], True) is None
+    assert tool.compiled(["fault_tolerant_noise"], True) == "fault_tolerant_noise: its plant has noise of its own"
+
+
+def _noted(jobs):
+    def noted(_, names, abreast):
+        jobs.extend(zip(names, abreast, strict=True))
+        return []
+
+    return noted
