@@ -6,13 +6,13 @@ sampled         formations of six trains under ``fully_distributed``, 600 steps,
 monte_carlo     the same with the errors and losses of the sweep ``monte_carlo``
 set_up          the models of ``monte_carlo`` and their stack, alone
 two_at_once     ``monte_carlo`` in two processes; ``to one`` is how many times one process they do together
-finite_time     ``emu_finite_time`` (3 trains x 4 units), 10 runs of 20 s
-fault_tolerant  ``fault_tolerant`` (3 trains x 3 units), 10 runs of 20 s
+finite_time     ``emu_finite_time`` (3 trains x 4 units), 10 runs of 100 s; ``..._1000``: 334 runs, some 1000 trains
+fault_tolerant  the same with ``fault_tolerant`` (3 trains x 3 units)
 single          one run of ``sampled`` through the whole loop, tables and metrics included
 ==============  ================================================================================================================
 
 ``M/s`` are million train-steps per second of processor time of one core, the median of the repeats, each of which takes one case
-after the other; ``to plain`` is the median of their ratios.
+after the other; ``to plain`` is the median of their ratios, ``to 1000`` that of the time a train-step takes against ``..._1000``.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from numba import njit
 
 STEPS, TRAINS = 600, 6
 UNITS = {"finite_time": "emu_finite_time", "fault_tolerant": "fault_tolerant"}
+FEW, MANY, SECONDS = 10, 334, 100.0
 
 
 @njit(error_model="numpy")
@@ -124,7 +125,8 @@ def two_at_once(runs: int) -> float:
 def ensembles(runs: int, repeats: int) -> list[dict[str, Any]]:
     """Rows of all cases."""
     prepared = {"sampled": models(runs, 0.0, False), "monte_carlo": models(runs, 0.2, True)}
-    prepared |= {case: of_units(name, 10, 20.0) for case, name in UNITS.items()}
+    for case, name in UNITS.items():
+        prepared |= {case: of_units(name, FEW, SECONDS), f"{case}_1000": of_units(name, MANY, SECONDS)}
 
     def set_up() -> int:
         from trainctl.ensemble.stack import stacked
@@ -143,9 +145,13 @@ def ensembles(runs: int, repeats: int) -> list[dict[str, Any]]:
             rates[case].append(steps / seconds / 1e6)
     rows = [
         {
-            "case": case, "runs": 1 if case == "single" else 10 if case in UNITS else runs,
+            "case": case, "runs": 1 if case == "single" else len(prepared.get(case, [None] * runs)),
             "million_per_s": round(statistics.median(each), 3), "us_per_train_step": round(1.0 / statistics.median(each), 4),
             "to_plain": round(statistics.median(a / b for a, b in zip(each, rates["plain"], strict=True)), 5),
+            **(
+                {"to_1000": round(statistics.median(b / a for a, b in zip(each, rates[f"{case}_1000"], strict=True)), 3)}
+                if case in UNITS else {}
+            ),
         }
         for case, each in rates.items()
     ]  # fmt: skip
@@ -154,7 +160,8 @@ def ensembles(runs: int, repeats: int) -> list[dict[str, Any]]:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Rows in columns."""
-    lines = [f"{'case':<14} {'runs':>6} {'M/s':>9} {'us/train-step':>14} {'to plain':>9}"]
+    keys = {"million_per_s": "M/s", "us_per_train_step": "us/train-step", "to_plain": "to plain", "to_1000": "to 1000"}
+    lines = [f"{'case':<20} {'runs':>6}" + "".join(f" {title:>13}" for title in keys.values())]
     for r in rows[:-1]:
-        lines.append(f"{r['case']:<14} {r['runs']:>6} {r['million_per_s']:>9} {r['us_per_train_step']:>14} {r['to_plain']:>9}")
+        lines.append((f"{r['case']:<20} {r['runs']:>6}" + "".join(f" {r.get(key, ''):>13}" for key in keys)).rstrip())
     return "\n".join([*lines, f"two processes at once do {rows[-1]['to_one']} times what one does"])
