@@ -55,7 +55,8 @@ def shares(first: Ints, links: Links, talk: bool, threads: int) -> Shares:
     links : Links
         Who receives from whom.
     talk : bool
-        Whether they do within a stretch of integration; else trains may be cut anywhere.
+        Whether they do within a stretch of integration, or their law watches them there by the state of others; else trains may be
+        cut anywhere.
     threads : int
         At most so many shares.
     """

@@ -227,7 +227,9 @@ class Units:
         """The trains by threads; a law that does not say what it writes into may have one only."""
         own_space: tuple[str, ...] | None = getattr(self.law, "WORK", None)
         most = 1 if own_space is None else threads.cores()
-        found = threads.shares(self.p.consists.first, links, self.law.MESSAGE > 0 and self.period is None, most)
+        talk = self.law.MESSAGE > 0 and self.period is None
+        # What a law watches is told by the trains ahead as well, of the same instant: no block may be a step behind another.
+        found = threads.shares(self.p.consists.first, links, talk or len(self.law.WATCHED) > 0, most)
         if len(found.blocks) == 1:
             return found
         if self.pool is None:

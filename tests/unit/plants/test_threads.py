@@ -78,10 +78,12 @@ def test_the_environment_says_how_many_threads_there_are(monkeypatch):
     assert threads.cores() >= 1
 
 
-def ran(case: str, folder: Path, number: int, monkeypatch: Any) -> tuple[Any, int]:
+def ran(case: str, folder: Path, number: int, monkeypatch: Any, by_radio: bool = False) -> tuple[Any, int]:
     """State after some steps of twelve trains in six formations, and how many threads there were."""
     folder.mkdir()
     text, line = bench.scenario(case, 12, 5, tracks=6)
+    if by_radio:
+        text = text.replace("[topology]", "[topology]\ncommunication_period_s = 0.5")
     (folder / "scenario.toml").write_text(text)
     (folder / "line.toml").write_text(line)
     monkeypatch.setenv(threads.THREADS, str(number))
@@ -113,6 +115,18 @@ def test_no_bit_depends_on_what_is_known_of_the_trains(case, tmp_path, monkeypat
     monkeypatch.setattr(views, "WORTH", 1)
     known, _ = ran(case, tmp_path / "known", 2, monkeypatch)
     assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(plain, known, strict=True))
+
+
+@pytest.mark.parametrize("case", ["finite_time", pytest.param("actuated_units", marks=pytest.mark.campaign)])
+def test_what_is_watched_is_of_one_instant_though_messages_are_held(case, tmp_path, monkeypatch):
+    """Nothing is received within a stretch then, but intervals to the trains ahead are watched in it."""
+    together, _ = ran(case, tmp_path / "together", 1, monkeypatch, by_radio=True)
+    monkeypatch.setattr(threads, "LEAST", 1)
+    monkeypatch.setattr(threads, "TOGETHER", 1)
+    for number in (1, 2):
+        apart, many = ran(case, tmp_path / str(number), number, monkeypatch, by_radio=True)
+        assert many == number
+        assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(together, apart, strict=True))
 
 
 def test_a_law_that_does_not_say_what_it_writes_into_has_one_thread(tmp_path, monkeypatch):
