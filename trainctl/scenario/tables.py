@@ -17,7 +17,7 @@ from trainctl.plants.faults import Fault
 from trainctl.railway.supervisor import Params as Supervisor
 from trainctl.scenario.channel import Channel
 from trainctl.scenario.events import Event, Order
-from trainctl.scenario.keys import Id, NotNegative, PerUnit, Positive
+from trainctl.scenario.keys import Id, NotNegative, PerUnit, Positive, Seed
 from trainctl.scenario.reference import Profile
 from trainctl.signals import Bounds, Consists, Floats, Table
 
@@ -43,7 +43,7 @@ class RunTable(Table):
         None,
         description="Time between rows of trains, units, links and SUMO's FCD [s]; default every step. Extremes stay exact.",
     )
-    seed: int | None = Field(None, ge=0, description="Seed of everything random; required as soon as something is.")
+    seed: Seed | None = Field(None, description="Seed of everything random; required as soon as something is.")
 
     @model_validator(mode="after")
     def _multiples(self) -> RunTable:

@@ -204,7 +204,10 @@ def _column(column: list[Any]) -> Any:
 
     known, kind = [value for value in column if value is not None], None
     if known and all(isinstance(value, int | float) and not isinstance(value, bool) for value in known):
-        kind = pa.int64() if all(isinstance(value, int) for value in known) else pa.float64()
+        if all(isinstance(value, int) and -(2**63) <= value < 2**63 for value in known):
+            kind = pa.int64()
+        else:
+            kind, column = pa.float64(), [value if value is None else float(value) for value in column]
     if kind is None and not (known and all(isinstance(value, bool) for value in known)):
         kind, column = pa.string(), [value if value is None else str(value) for value in column]
     return pa.array(column, kind)

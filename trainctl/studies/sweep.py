@@ -18,7 +18,6 @@ import tomllib
 import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,9 +25,11 @@ from typing import Any
 import numpy as np
 
 from sumo_net.bounded import short_text
-from trainctl.errors import InputError, TrainctlError
+from trainctl.errors import InputError
+from trainctl.scenario.keys import MOST_SEED
 from trainctl.scenario.reading import examine, find, read, shipped
 from trainctl.studies.blocks import blocks, refusal, simulate_block
+from trainctl.studies.cluster import MOST_DEATHS, client_of
 from trainctl.studies.jobs import Batch, Job, job_model, simulate
 from trainctl.studies.results import (
     RESULTS,
@@ -45,8 +46,8 @@ from trainctl.studies.results import (
 FORMAT = "trainctl sweep"
 INFO, ROWS, PARTS, FIGURE = "sweep.json", "rows.jsonl", "parts", "summary.png"
 
-#: A run whose worker dies is given to another one; after so many deaths it is taken for the cause.
-MOST_DEATHS = 3
+#: Seeds of one sweep: each is kept with its result until all are written.
+MOST_SEEDS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -63,11 +64,12 @@ class SweepPlan:
     backend: str = "sumo"
 
     def combinations(self) -> list[dict[str, Any]]:
-        """Parameters of every run, in the order of the dataset."""
+        """Parameters of every run, in the order of the dataset; what is given twice counts once."""
         axes = dict(self.settings)
         if self.seeds:
             axes["run.seed"] = list(self.seeds)
-        return [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+        found = (dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values()))
+        return list({_key(parameters): parameters for parameters in found}.values())
 
 
 # What to run
@@ -103,6 +105,10 @@ def seeds(text: str) -> list[int]:
             raise InputError(f"--seeds {text}: must be like 0..99 or 1,2,5..9") from None
         if low < 0 or high < low:
             raise InputError(f"--seeds {text}: {piece.strip()} is empty or negative")
+        if high > MOST_SEED:
+            raise InputError(f"--seeds {text}: {piece.strip()}: a seed must be at most {MOST_SEED}")
+        if len(found) + high - low >= MOST_SEEDS:
+            raise InputError(f"--seeds {text}: more than {MOST_SEEDS} seeds")
         found += range(low, high + 1)
     return list(dict.fromkeys(found))
 
@@ -374,7 +380,7 @@ def _scattered(todo: Sequence[Job | Batch], workers: int | None, scheduler: str 
     """Tasks and what they gave, as it comes from the cluster. Dask gives what a dead worker had to another one."""
     from distributed import as_completed
 
-    with _client(min(workers or os.cpu_count() or 1, len(todo)), scheduler) as client:
+    with client_of(min(workers or os.cpu_count() or 1, len(todo)), scheduler) as client:
         once = uuid.uuid4().hex
         futures = client.map(_done, todo, key=[f"trainctl-{once}-{k}" for k in range(len(todo))], pure=False)
         whose = {future.key: task for future, task in zip(futures, todo, strict=True)}
@@ -390,35 +396,6 @@ def _scattered(todo: Sequence[Job | Batch], workers: int | None, scheduler: str 
                 future.release()
         finally:
             client.cancel(futures, force=True)
-
-
-@contextmanager
-def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
-    """A client of the scheduler at an address, or of a cluster on this machine: processes of one thread each, all spawned."""
-    import dask
-    from distributed import Client, LocalCluster
-
-    with dask.config.set(
-        {"distributed.scheduler.allowed-failures": MOST_DEATHS, "distributed.worker.multiprocessing-method": "spawn"}
-    ):
-        if scheduler is not None:
-            try:
-                where = {"scheduler_file": scheduler} if scheduler.endswith(".json") else {"address": scheduler}
-                client = Client(**where, timeout=10, set_as_default=False)  # type: ignore[no-untyped-call]
-            except (OSError, ValueError, TypeError) as error:
-                raise InputError(f"--scheduler {scheduler}: no Dask scheduler answers there: {error}") from None
-            with client:
-                yield client
-            return
-        try:
-            cluster = LocalCluster(  # type: ignore[no-untyped-call]
-                n_workers=workers, threads_per_worker=1, processes=True, memory_limit=0, silence_logs=50,
-                host="127.0.0.1", dashboard_address="127.0.0.1:0",  # not to be reached from elsewhere
-            )  # fmt: skip
-        except (RuntimeError, OSError) as error:
-            raise TrainctlError(f"workers could not be started on 127.0.0.1, is the loopback up? {error}") from None
-        with cluster, Client(cluster, set_as_default=False) as client:  # type: ignore[no-untyped-call]
-            yield client
 
 
 # The folder

@@ -13,6 +13,7 @@ References
 from __future__ import annotations
 
 import os
+import signal
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -344,8 +345,13 @@ def _judges(workers: int) -> Iterator[Callable[[Callable[[Any], Candidate], Sequ
     if workers == 1:
         yield map
         return
-    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        yield pool.map
+    # Ctrl-C is for this process, though a terminal sends it to all; what has not begun yet is left then.
+    with ProcessPoolExecutor(workers, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
+        try:
+            yield pool.map
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 # What was found

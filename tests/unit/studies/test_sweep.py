@@ -11,7 +11,7 @@ import pytest
 from trainctl.errors import InputError, LawError, TrainctlError
 from trainctl.record.folder import held
 from trainctl.studies import sweep as sweeping
-from trainctl.studies.results import shares, wilson
+from trainctl.studies.results import part, shares, wilson, write_results
 from trainctl.studies.sweep import SweepPlan, half_width, job_model, jobs, seeds, sweep, values
 
 SHORT = {"run.duration_s": [20]}
@@ -61,9 +61,21 @@ def test_values_are_toml_or_bare_words(text, key, found):
 def test_seeds_are_ranges_and_numbers():
     assert seeds("0..3") == [0, 1, 2, 3]
     assert seeds("1,2,5..7,2") == [1, 2, 5, 6, 7]
-    for wrong in ("a", "3..1", "-1", "1..", ""):
+    for wrong in ("a", "3..1", "-1", "1..", "", str(2**63), "0..1000000", "0..9999999999"):
         with pytest.raises(InputError, match="--seeds"):
             seeds(wrong)
+    assert seeds(str(2**63 - 1)) == [2**63 - 1]
+
+
+def test_what_is_given_twice_is_done_once():
+    plan = SweepPlan("fully_distributed", {"run.duration_s": [20, 20, 30], "event": [[], []]}, [1, 2, 1], {}, "numeric")
+    assert [(one["run.duration_s"], one["run.seed"]) for one in plan.combinations()] == [(20, 1), (20, 2), (30, 1), (30, 2)]
+
+
+def test_numbers_beyond_64_bits_are_no_integers_in_the_dataset(tmp_path):
+    found = part([{"run": k, "parameters": {"mass": mass}, "status": "complete"} for k, mass in enumerate((10**20, 7, None))])
+    frame = write_results(found, [0, 1, 2], tmp_path / "results.parquet")
+    assert frame["mass"].tolist()[:2] == [1e20, 7.0]
 
 
 def test_jitter_needs_a_key_of_trains_and_a_width():
