@@ -85,7 +85,8 @@ def sources() -> list[Path]:
     """Files of which something is compiled into code that stands in another file."""
     here = Path(__file__).parent
     folders, files = ("plants", "controllers", "observers", "topology", "railway"), ("signals", "davis", "draws", "kernels")
-    constants = ("metrics/driving", "metrics/run", "metrics/traffic", "monitors/on_track")  # of what is counted of stacked runs
+    # Constants of what is counted of stacked runs.
+    constants = ("ensemble/count", "metrics/driving", "metrics/run", "metrics/traffic", "monitors/on_track", "runs/schema")
     return sorted([*(p for f in folders for p in (here / f).glob("*.py")), *(here / f"{f}.py" for f in (*files, *constants))])
 
 

@@ -179,6 +179,7 @@ def simulated(stack: Stack) -> Done:
     violations = _violations(stack, counts)
     if tallied is not None:
         violations += units.violations(*tallied, len(stack.runs))
+        units.check_extremes(stack, *tallied, counts)
     return Done(
         s.own, measures.metrics(stack, fixed, chained, counts, recorded, tallied), violations,
         (bits & count.ABOVE_LIMIT > 0).sum(axis=1), _why_alone(abreast, s, counts.fate),

@@ -15,6 +15,7 @@ from trainctl.metrics.run import SLACK
 from trainctl.monitors import energy
 from trainctl.monitors.on_track import ROUNDING
 from trainctl.runs.known import Range, facts_of
+from trainctl.runs.schema import GREATEST
 from trainctl.signals import POSITION, POWERS, SPEED, Bools, Consists, Extremes, Floats, Ints, Row, Scene
 
 #: Rows of ``Tally.low`` and ``Tally.high``.
@@ -77,11 +78,13 @@ def count(stack: Stack, fixed: Watched, row: Row, tally: Tally, counts: Counts) 
     tally.balance[[i for i, _ in fixed.balance.violated(row, tally.energies)]] = True
     if row.extremes is not None:
         force = np.full(len(row.own), np.nan) if row.motion is None or row.motion.force is None else row.motion.force
-        _count(stack.model.consists, fixed.kept, row.time, row.own, force, row.extremes, tally, counts.first)
+        _count(stack.model.consists, fixed.kept, row.time, row.own, force, row.extremes, tally, counts.first, counts.fate)
 
 
 @bare(error_model="numpy")
-def _count(consists: Consists, kept: Kept, t: float, own: Floats, force: Floats, x: Extremes, tally: Tally, late: Floats) -> None:
+def _count(
+    consists: Consists, kept: Kept, t: float, own: Floats, force: Floats, x: Extremes, tally: Tally, late: Floats, fate: Ints
+) -> None:  # fmt: skip
     """Count what is recorded, as ``record.columns.UNITS`` has it. ``force`` (U,) [N] is NaN at the end; ``late``: ``Counts.first``.
 
     What is NaN widens nothing, and what was never seen is infinite the other way round.
@@ -109,6 +112,9 @@ def _count(consists: Consists, kept: Kept, t: float, own: Floats, force: Floats,
         tally.work[1, i] += x.energy[i, BRAKING]
         if own[first[i], SPEED] > ELECTRIC_BRAKE_FROM_MPS:
             tally.work[2, i] += x.energy[i, BRAKING]
+        for p in range(x.energy.shape[1]):
+            if not abs(x.energy[i, p]) <= GREATEST:
+                fate[kept.run[first[i]]] = NOT_FINITE
         for q in range(x.watched.shape[1]):
             least, most = x.watched_min[i, q], x.watched_max[i, q]
             tally.watched[0, i, q], tally.watched[1, i, q] = min(tally.watched[0, i, q], least), max(tally.watched[1, i, q], most)
@@ -127,10 +133,18 @@ def _widen(low, high, k, u, least, most):  # type: ignore[no-untyped-def]
 
 
 def check(fixed: Watched, own: Floats, estimate: Floats, counts: Counts) -> None:
-    """Mark runs whose numbers are no longer finite, or whose observers have diverged."""
-    wild = ~np.isfinite(own).all(axis=1)
+    """Mark runs with numbers that are none of a run, see ``runs.schema``, or whose observers have diverged."""
+    wild = ~(np.abs(own) <= GREATEST).all(axis=1)
     wild |= ~(np.abs(estimate) < ASTRAY).all(axis=1)
     counts.fate[fixed.kept.run[wild]] = NOT_FINITE
+
+
+def check_extremes(stack: Stack, fixed: Watched, tally: Tally, counts: Counts) -> None:
+    """Mark runs whose extremes are none of a run; what was never seen is infinite."""
+    run, train = fixed.kept.run, fixed.kept.run[stack.model.leading]
+    for least, most, of in ((tally.low, tally.high, run), (tally.watched[0].T, tally.watched[1].T, train)):
+        beyond = (least <= most) & ((np.abs(least) > GREATEST) | (np.abs(most) > GREATEST))
+        counts.fate[of[beyond.any(axis=0)]] = NOT_FINITE
 
 
 def violations(fixed: Watched, tally: Tally, runs: int) -> Ints:

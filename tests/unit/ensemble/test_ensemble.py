@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from trainctl.ensemble import units
 from trainctl.ensemble.stack import alone, kind, stacked
 from trainctl.ensemble.steps import simulated
 from trainctl.runner import run
@@ -122,6 +123,20 @@ def test_the_cases_violate_something_and_are_too_fast_somewhere():
     assert done.violations.min() >= 6
     assert done.overspeeds.max() >= 1
     assert max(done.metrics[f"bounds.spacing_{side}_margin_m"].min() for side in ("lower", "upper")) < 0.0
+
+
+def test_a_run_with_numbers_that_no_log_may_have_is_run_alone(monkeypatch):
+    """It is refused there; none of these is infinite, and no state is among them."""
+    runs, count = models("emu_finite_time", {"run.duration_s": 3}, 4), units.count
+
+    def spoilt(stack, fixed, row, tally, counts):
+        row.extremes.energy[3, 2] = 1e61
+        row.extremes.coupler_max[2 * 12] = 1e61
+        row.extremes.watched_min[3 * 3 + 1, 0] = -1e61
+        count(stack, fixed, row, tally, counts)
+
+    monkeypatch.setattr(units, "count", spoilt)
+    assert simulated(stacked(runs)).why_alone == (None, *["its numbers are no longer finite"] * 3)
 
 
 def test_a_run_does_not_depend_on_those_beside_it():
