@@ -18,6 +18,7 @@ import tomllib
 import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -351,7 +352,8 @@ def _tasks(planned: Sequence[Batch], done: set[int], workers: int) -> tuple[list
         if all(number in done for number in left.numbers):
             continue
         place = {key: batch.job.tables.get(key) for key in ("network", "controller")}
-        reason, model = refusal(left, beside[1] if beside[0] == place else None)
+        # Whether they are stacked goes by the whole batch: sums of stacked runs have other last bits, however few are left.
+        reason, model = refusal(batch, beside[1] if beside[0] == place else None)
         if model is not None:
             beside = place, model
         if reason is None and model is not None:
@@ -443,7 +445,7 @@ def _open_folder(out: Path, identity: Mapping[str, Any], resume: bool, force: bo
         if other:
             raise InputError([f"{out}: --resume: its {key} is {info.get(key)}, now it is {identity[key]}" for key in other])
         (out / PARTS).mkdir(exist_ok=True)
-        return [*_rows(out / ROWS), *map(read_part, sorted((out / PARTS).glob("*.parquet")))]
+        return [*_rows(out / ROWS), *_parts(out / PARTS)]
     if not (free(out) or force):
         hint = "--resume goes on with it, --force replaces it" if ours else "choose another --out, or --force to replace it"
         raise InputError(f"{out}: {'holds a sweep' if ours else 'exists and is not a sweep of trainctl'}: {hint}")
@@ -455,6 +457,15 @@ def _open_folder(out: Path, identity: Mapping[str, Any], resume: bool, force: bo
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror}") from None
     return []
+
+
+def _parts(folder: Path) -> list[Part]:
+    """What was done side by side; blocks that cannot be read, since a disk was full or the power failed, are done again."""
+    found = []
+    for path in sorted(folder.glob("*.parquet")):
+        with suppress(OSError, ValueError, KeyError):
+            found.append(read_part(path))
+    return found
 
 
 def _rows(path: Path) -> list[Part]:

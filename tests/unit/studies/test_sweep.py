@@ -266,6 +266,21 @@ def test_runs_side_by_side_give_one_dataset_however_they_are_cut_and_resumed(her
     assert sweep(MANY, tmp_path / "cut", resume=True, progress=lambda *numbers: told.append(numbers))["complete"] == 26
     assert told[0][0] > kept
     assert (tmp_path / "cut" / "results.parquet").read_bytes() == whole
+    for path, left in zip(sorted((tmp_path / "cut" / "parts").iterdir()), (0, 500), strict=False):
+        path.write_bytes(path.read_bytes()[:left])
+    assert sweep(MANY, tmp_path / "cut", resume=True)["complete"] == 26
+    assert (tmp_path / "cut" / "results.parquet").read_bytes() == whole
+
+
+def test_few_runs_that_are_left_are_done_as_the_others_were(here, tmp_path):
+    """Sums of a run by itself have other last bits."""
+    sweep(MANY, tmp_path / "whole", workers=1)
+    here[0] = 3  # of the second batch 4 are left
+    with pytest.raises(KeyboardInterrupt):
+        sweep(MANY, tmp_path / "cut", workers=1)
+    here[0] = 1000
+    assert sweep(MANY, tmp_path / "cut", workers=1, resume=True)["alone"] == {}
+    assert (tmp_path / "cut" / "results.parquet").read_bytes() == (tmp_path / "whole" / "results.parquet").read_bytes()
 
 
 def test_runs_side_by_side_give_the_dataset_of_single_ones(here, tmp_path, monkeypatch):
