@@ -6,16 +6,15 @@ each time; the tests of the papers measure with the same functions. ``README.md`
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from functools import cached_property
 from importlib import import_module
 from typing import Any
 
 from trainctl.citation import PAPERS
 from trainctl.claims.claim import BEYOND, NOT, REPRODUCED, VERDICTS, WITH_CORRECTION, Claim
+from trainctl.processes import processes
 
 __all__ = [
     "BEYOND", "NOT", "REPRODUCED", "VERDICTS", "WITH_CORRECTION", "Claim", "as_markdown", "counts", "measure",
@@ -66,14 +65,9 @@ def _closed_loops(jobs: Sequence[tuple[str, str]], workers: int) -> Iterable[tup
     if workers == 1:
         yield from map(_closed_loop, *zip(*jobs, strict=True))
         return
-    pool = ProcessPoolExecutor(
-        min(workers, len(jobs)), multiprocessing.get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)
-    )
-    try:
+    with processes(min(workers, len(jobs))) as pool:
         for job in as_completed([pool.submit(_closed_loop, *job) for job in jobs]):
             yield job.result()
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def _closed_loop(paper: str, name: str) -> tuple[str, str, Any]:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from trainctl.errors import InputError
 from trainctl.signals import Ints, Links
 
 #: Environment variable with the number of threads; all cores if it is not set.
@@ -39,9 +40,10 @@ ALONE = Shares((), np.zeros(0, np.int64))
 
 def cores() -> int:
     """How many threads there may be: as the environment says, or as many as the process has cores."""
-    given = os.environ.get(THREADS, "")
-    if given.isdigit():
-        return max(int(given), 1)
+    if given := os.environ.get(THREADS, "").strip():
+        if not (given.isascii() and given.isdigit() and int(given) >= 1):
+            raise InputError(f"{THREADS}={given}: must be a whole number, at least 1")
+        return int(given)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1  # macOS has none
 
 

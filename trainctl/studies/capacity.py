@@ -23,9 +23,8 @@ import json
 import math
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -37,6 +36,7 @@ from sumo_net import LineError
 from trainctl.controllers.sumo import LONGEST_BLOCK_M
 from trainctl.errors import InputError, TrainctlError
 from trainctl.laws import compared
+from trainctl.processes import ended_with, spawned
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -345,7 +345,7 @@ def compare(
     done: dict[str, dict[str, Any]] = {}
     if progress is not None:
         progress(0, len(rows))
-    with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
+    with ended_with(pool := ThreadPoolExecutor(workers or os.cpu_count() or 1)):
         waiting = {pool.submit(_alone, out / f"{row}.toml", out / row, plan): row for row in rows}
         for k, future in enumerate(as_completed(waiting), 1):
             done[waiting[future]] = future.result()
@@ -379,7 +379,7 @@ def prepare_files(plan: CapacityPlan, out: Path, rows: Sequence[str]) -> None:
 def _alone(file: Path, out: Path, plan: CapacityPlan) -> dict[str, Any]:
     """Run a row in a process that ends with it: libsumo holds one simulation, and a crash is that row's only."""
     try:
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+        with spawned(1) as process:
             return process.submit(one, file, out, plan).result()
     except (BrokenProcessPool, OSError) as error:
         return {**dict.fromkeys(MEASURED), "error": str(error)}

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-import multiprocessing
 import os
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +15,7 @@ import numpy as np
 import tomli_w
 
 from trainctl.errors import InputError, TrainctlError, left_out
+from trainctl.processes import processes
 from trainctl.record.folder import write_json
 from trainctl.signals import POSITION, SPEED, Trains
 from trainctl.studies.capacity import LAW_ROWS
@@ -267,7 +267,7 @@ def compare(
     todo = [row for row in rows if not (resume and _asked_the_same(plan, out / row))]
     if progress is not None:
         progress(len(rows) - len(todo), len(rows))
-    with ProcessPoolExecutor(workers or os.cpu_count() or 1, multiprocessing.get_context("spawn")) as pool:
+    with processes(workers or os.cpu_count() or 1) as pool:
         longest_first = sorted(todo, key=lambda row: LAW_ROWS[row].CLOCK == "sampled")
         waiting = [pool.submit(_kept, plan, row, out / row, sumo) for row in longest_first]
         for k, future in enumerate(as_completed(waiting), len(rows) - len(todo) + 1):

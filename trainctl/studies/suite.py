@@ -13,10 +13,9 @@ from __future__ import annotations
 
 import json
 import math
-import multiprocessing
 import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -24,6 +23,7 @@ import numpy as np
 import tomli_w
 
 from trainctl.errors import InputError, LawError
+from trainctl.processes import processes
 from trainctl.record.folder import write_json
 from trainctl.signals import POSITION, SPEED
 from trainctl.studies.capacity import BAND_MPS, LAW_ROWS
@@ -324,7 +324,7 @@ def compare(
     todo = [key for key, place in places.items() if not (resume and (place / "cell.json").is_file())]
     if progress is not None:
         progress(len(places) - len(todo), len(places))
-    with ProcessPoolExecutor(workers or os.cpu_count() or 1, multiprocessing.get_context("spawn")) as pool:
+    with processes(workers or os.cpu_count() or 1) as pool:
         waiting = [pool.submit(_kept, plan, *key, places[key]) for key in todo]
         for k, future in enumerate(as_completed(waiting), len(places) - len(todo) + 1):
             future.result()

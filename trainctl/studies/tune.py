@@ -13,14 +13,11 @@ References
 from __future__ import annotations
 
 import os
-import signal
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -28,6 +25,7 @@ import numpy as np
 import tomli_w
 
 from trainctl.errors import InputError
+from trainctl.processes import processes
 from trainctl.scenario.reading import find, read
 from trainctl.signals import Floats
 from trainctl.studies.blocks import simulate_block
@@ -345,13 +343,8 @@ def _judges(workers: int) -> Iterator[Callable[[Callable[[Any], Candidate], Sequ
     if workers == 1:
         yield map
         return
-    # Ctrl-C is for this process, though a terminal sends it to all; what has not begun yet is left then.
-    with ProcessPoolExecutor(workers, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
-        try:
-            yield pool.map
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    with processes(workers) as pool:
+        yield pool.map
 
 
 # What was found

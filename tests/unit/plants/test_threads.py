@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from trainctl.errors import InputError
 from trainctl.loop import Loop
 from trainctl.numeric import Numeric
 from trainctl.plants import threads, views
@@ -72,10 +73,12 @@ def test_few_trains_are_left_to_one_thread():
 def test_the_environment_says_how_many_threads_there_are(monkeypatch):
     monkeypatch.setenv(threads.THREADS, "3")
     assert threads.cores() == 3
-    monkeypatch.setenv(threads.THREADS, "0")
-    assert threads.cores() == 1
     monkeypatch.delenv(threads.THREADS)
     assert threads.cores() >= 1
+    for wrong in ("0", "-1", "two", "2.5", "²"):
+        monkeypatch.setenv(threads.THREADS, wrong)
+        with pytest.raises(InputError, match=f"TRAINCTL_THREADS={wrong}: must be a whole number, at least 1"):
+            threads.cores()
 
 
 def ran(case: str, folder: Path, number: int, monkeypatch: Any, by_radio: bool = False) -> tuple[Any, int]:
