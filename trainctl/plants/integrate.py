@@ -197,7 +197,7 @@ def exchange_kernel(code, loop, first, links, references, received, t, own, esti
         message(i, loop.law, work.leader, links.slot[i], own[a:b], estimate[a:b], work.estimate_rate[a:b], work.sent[i])
 
 
-@bare(cache=False, forceinline=True)
+@bare(cache=False)
 def see(code, loop, first, length, links, references, t, inside, own, work, extremes, low, high):  # type: ignore[no-untyped-def]
     """Widen ``extremes`` of trains ``low`` to ``high`` by the state and the forces of this instant; what is NaN widens nothing."""
     watch = part(code, LAW, "watch")
