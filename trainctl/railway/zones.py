@@ -58,12 +58,19 @@ def short_of_junctions(ways: Ways, net: Net, internal: Bools, train: Ints, row: 
     train, room : ndarray, shape (k,)
         Trains, and the room from their fronts to the beginning of an edge [m]; inf: none.
     """
+    return _short_of_junctions(ways, net.joins, internal, train, row, s, room)
+
+
+@njit(cache=True)
+def _short_of_junctions(ways: Ways, joins: Bools, internal: Bools, train: Ints, row: Ints, s: Floats, room: Floats) -> Floats:
     found = room.copy()
-    for q in np.flatnonzero(np.isfinite(room) & (room > 0.0)).tolist():
-        i = int(train[q])
-        a, b = int(row[i]), int(ways.first[i + 1])
-        k = a + int(np.searchsorted(ways.begin[a:b], s[i] + room[q] - TOUCH_M))
-        if k < b and net.joins[ways.edge[k]]:
+    for q in range(len(room)):
+        if not 0.0 < room[q] < np.inf:
+            continue
+        i = train[q]
+        a, b = row[i], ways.first[i + 1]
+        k = a + np.searchsorted(ways.begin[a:b], s[i] + room[q] - TOUCH_M)
+        if k < b and joins[ways.edge[k]]:
             while k > a and internal[ways.edge[k - 1]]:
                 k -= 1
             found[q] = max(ways.begin[k] - s[i], 0.0)
