@@ -16,9 +16,9 @@ import os
 import time
 import tomllib
 import uuid
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -463,8 +463,10 @@ def _parts(folder: Path) -> list[Part]:
     """What was done side by side; blocks that cannot be read, since a disk was full or the power failed, are done again."""
     found = []
     for path in sorted(folder.glob("*.parquet")):
-        with suppress(OSError, ValueError, KeyError):
+        try:
             found.append(read_part(path))
+        except (OSError, ValueError, KeyError):
+            warnings.warn(f"{path}: cannot be read: its runs are done again", stacklevel=2)
     return found
 
 

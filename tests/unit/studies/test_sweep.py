@@ -268,7 +268,9 @@ def test_runs_side_by_side_give_one_dataset_however_they_are_cut_and_resumed(her
     assert (tmp_path / "cut" / "results.parquet").read_bytes() == whole
     for path, left in zip(sorted((tmp_path / "cut" / "parts").iterdir()), (0, 500), strict=False):
         path.write_bytes(path.read_bytes()[:left])
-    assert sweep(MANY, tmp_path / "cut", resume=True)["complete"] == 26
+    with pytest.warns(UserWarning, match="cannot be read: its runs are done again") as said:
+        assert sweep(MANY, tmp_path / "cut", resume=True)["complete"] == 26
+    assert len(said) == 2
     assert (tmp_path / "cut" / "results.parquet").read_bytes() == whole
 
 

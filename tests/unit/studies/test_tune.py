@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import signal
 
 import pandas as pd
 import pytest
 
 from trainctl.errors import InputError
 from trainctl.scenario.build import open_scenario
-from trainctl.studies.tune import REFUSED, VIOLATED, Gain, TunePlan, _judges, gain, judged, objective, prepared, tune
+from trainctl.studies.tune import REFUSED, VIOLATED, Gain, TunePlan, gain, judged, objective, prepared, tune
 
 PLAN = TunePlan(
     "robust_constrained",
@@ -103,9 +102,3 @@ def test_what_is_asked_twice_is_refused_and_what_cannot_run_is_told(tmp_path, ty
     assert (code, lines) == (2, ["--objective energy: given twice"])
     info = tune(dataclasses.replace(PLAN, gains=(Gain("h_per_s", -5.0, -1.0),), evaluations=16), tmp_path / "b", workers=1)
     assert 0 < info["refused"] == info["candidates"] - 1 and "must be above 0" in info["refusal"]
-
-
-def test_ctrl_c_is_left_to_the_program_that_started_the_search():
-    """A terminal sends it to all processes; theirs ended in tracebacks."""
-    with _judges(2) as judges:
-        assert list(judges(signal.getsignal, [signal.SIGINT])) == [signal.SIG_IGN]
